@@ -1,0 +1,45 @@
+"""Clocks and switches of every cell on the device, so that a captured pass needs nothing from the host.
+
+Times, steps, faults and the loop condition lie in device arrays: every cell of a batch has its own clock and its own
+step, and stops alone when it is done or has lost its footing.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+NO_FAULT = 2**31 - 1
+
+
+@wp.struct
+class Control:
+    """Per cell [C] unless said otherwise."""
+
+    time: wp.array(dtype=wp.float64)  # [s]
+    target: wp.array(dtype=wp.float64)  # where this advance ends [s]
+    longest_step: wp.array(dtype=wp.float64)  # [s]
+    step: wp.array(dtype=wp.float64)  # the current one [s]
+    steps: wp.array(dtype=wp.int32)  # taken so far
+    fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
+    unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
+    budget: wp.array(dtype=wp.int32)  # [1], passes left before the host looks again
+    proceed: wp.array(dtype=wp.int32)  # [1], the loop condition
+
+
+@functools.cache
+def _kernels() -> SimpleNamespace:
+    module = wp.get_module("warpflag_kernels.control")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module)
+    def count_pass(control: Control):
+        control.budget[0] = control.budget[0] - 1
+        control.proceed[0] = wp.where(control.unfinished[0] > 0 and control.budget[0] > 0, 1, 0)
+
+    return SimpleNamespace(count_pass=count_pass)
+
+
+def count_pass(control: Control, device: object) -> None:
+    """Counts one pass of the captured loop and decides whether another follows."""
+    wp.launch(_kernels().count_pass, 1, inputs=[control], device=device)

@@ -1,0 +1,69 @@
+"""Rotations, minimal rotations between tangents, and the strains of a joint: device functions shared by the stages."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.types import Precision
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions of one precision."""
+    real, vec3, quat = p.real, p.vec3, p.quat
+    module = p.module("frames")
+
+    @wp.func(module=module)
+    def transport(v: vec3, t: vec3, u: vec3):
+        """v, perpendicular to the unit vector t, carried by the minimal rotation that takes t onto u."""
+        return v - (wp.dot(v, u) / (real(1.0) + wp.dot(t, u))) * (t + u)
+
+    @wp.func(module=module)
+    def transport_spin(t: vec3, u: vec3, u_rate: vec3):
+        """Rate at which a frame transported from the fixed t directly onto the moving u spins about u [rad/s]."""
+        return -wp.dot(wp.cross(t, u), u_rate) / (real(1.0) + wp.dot(t, u))
+
+    @wp.func(module=module)
+    def turn(v: vec3, axis: vec3, angle: real):
+        """v, perpendicular to the unit axis, turned about it."""
+        return v * wp.cos(angle) + wp.cross(axis, v) * wp.sin(angle)
+
+    @wp.func(module=module)
+    def perpendicular_unit(v: vec3, t: vec3):
+        """v made a unit vector perpendicular to t: removes the round-off that a long run gathers."""
+        return wp.normalize(v - wp.dot(v, t) * t)
+
+    @wp.func(module=module)
+    def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """Angle from a1, transported from t onto u, to b1 [rad]."""
+        pa = transport(a1, t, u)
+        return wp.atan2(wp.dot(wp.cross(pa, b1), u), wp.dot(pa, b1))
+
+    @wp.func(module=module)
+    def joint_strain(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """Strain h Omega of the joint between segments with tangents t, u and directors e1 = a1, b1 [rad]."""
+        kb = wp.cross(t, u) * (real(2.0) / (real(1.0) + wp.dot(t, u)))
+        w1 = real(0.5) * wp.dot(kb, a1 + b1)
+        w2 = real(0.5) * wp.dot(kb, wp.cross(t, a1) + wp.cross(u, b1))
+        return vec3(w1, w2, twist_angle(t, u, a1, b1))
+
+    @wp.func(module=module)
+    def rotation_vector_quat(w: vec3):
+        """Quaternion of the rotation by |w| about w."""
+        angle = wp.length(w)
+        half = real(0.5) * angle
+        scale = real(0.5) - angle * angle / real(48.0)
+        if angle > real(1.0e-3):
+            scale = wp.sin(half) / angle
+        return quat(w[0] * scale, w[1] * scale, w[2] * scale, wp.cos(half))
+
+    return SimpleNamespace(
+        transport=transport,
+        transport_spin=transport_spin,
+        turn=turn,
+        perpendicular_unit=perpendicular_unit,
+        twist_angle=twist_angle,
+        joint_strain=joint_strain,
+        rotation_vector_quat=rotation_vector_quat,
+    )

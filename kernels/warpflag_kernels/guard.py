@@ -1,0 +1,214 @@
+"""Guards: finite values, strain, twist and fold of every joint, crossed centre lines.
+
+A step too long, or a load too strong, gives finite garbage long before it gives NaN. So whenever a step is complete
+(every `interval` steps) these kernels look at the new state and note the first violated guard of the cell; the
+stepper then stops that cell. Crossings are found by following both segments of a near pair linearly from the last
+check to this one: where the four end points become coplanar, do the segments touch?
+"""
+
+import functools
+from enum import IntEnum
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels import chart as chart_stage
+from warpflag_kernels import frames, steric
+from warpflag_kernels.control import Control
+from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
+
+LARGEST_STRAIN = 0.05
+LARGEST_TWIST = 0.5 * 3.141592653589793  # per joint [rad]
+SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
+ELEMENT_BITS = 26
+
+
+class Fault(IntEnum):
+    """What a guard found; the lower value is reported when several fire at once."""
+
+    NOT_FINITE = 0
+    CROSSING = 1
+    STRAIN = 2
+    TWIST = 3
+    FOLD = 4
+
+
+def encode(kind: Fault) -> int:
+    """The fault's kind in the upper bits of the code; the element is added below."""
+    return int(kind) << ELEMENT_BITS
+
+
+def decode(code: int) -> tuple[Fault, int]:
+    """Kind and element of a fault code."""
+    return Fault(code >> ELEMENT_BITS), code & ((1 << ELEMENT_BITS) - 1)
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Guard`: what the last check saw."""
+    vec3 = p.vec3
+
+    @wp.struct
+    class Guard:
+        interval: wp.array(dtype=wp.int32)  # [C], steps between two checks
+        position: wp.array(dtype=vec3)  # [E], at the last check [um]; empty where nothing can cross
+
+    return Guard
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    Chart, Guard = chart_stage.struct(p), struct(p)
+    twist_angle = frames.functions(p).twist_angle
+    closest_parameters = steric.functions(p).closest_parameters
+    largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
+    not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
+    strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
+    module = p.module("guard")
+
+    @wp.func(module=module)
+    def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
+        return chart.commit[c] != 0 and (control.steps[c] + 1) % guard.interval[c] == 0
+
+    @wp.kernel(module=module)
+    def check_elements(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        guard: Guard,
+        # Out:
+        control: Control,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or not due(control, guard, chart, c):
+            return
+        k = model.flagellum_of[e]
+        x = state.position[e]
+        if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e])):
+            wp.atomic_min(control.fault, c, not_finite + e)
+            return
+        if e > model.first_node[k]:
+            if wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
+                wp.atomic_min(control.fault, c, strained + e)
+        if e + 1 < model.first_node[k + 1]:
+            t = state.tangent[e]
+            u = state.tangent[e + 1]
+            if real(1.0) + wp.dot(t, u) < smallest_fold:
+                wp.atomic_min(control.fault, c, folded + e)
+            if wp.abs(twist_angle(t, u, state.director[e], state.director[e + 1])) > largest_twist:
+                wp.atomic_min(control.fault, c, twisted + e)
+
+    @wp.func(module=module)
+    def volume(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
+        """Six times the signed volume of the tetrahedron of two segments' end points."""
+        return wp.dot(wp.cross(q1 - p1, q2 - p2), p2 - p1)
+
+    @wp.func(module=module)
+    def crossed(
+        p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real
+    ):
+        """Whether two segments pass through each other while their ends move linearly to the new places."""
+        before = volume(p1, q1, p2, q2)
+        after = volume(p1n, q1n, p2n, q2n)
+        if (before > real(0.0)) == (after > real(0.0)):
+            return False
+        low = real(0.0)
+        high = real(1.0)
+        for _step in range(24):
+            x = real(0.5) * (low + high)
+            v = volume(
+                p1 + x * (p1n - p1), q1 + x * (q1n - q1), p2 + x * (p2n - p2), q2 + x * (q2n - q2)
+            )
+            if (v > real(0.0)) == (before > real(0.0)):
+                low = x
+            else:
+                high = x
+        x = real(0.5) * (low + high)
+        a = p1 + x * (p1n - p1)
+        b = p2 + x * (p2n - p2)
+        da = q1 + x * (q1n - q1) - a
+        db = q2 + x * (q2n - q2) - b
+        st = closest_parameters(a, da, b, db)
+        return wp.length(a + st[0] * da - b - st[1] * db) < touch
+
+    @wp.kernel(module=module)
+    def check_crossings(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        guard: Guard,
+        # Out:
+        control: Control,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or not due(control, guard, chart, c):
+            return
+        k = model.flagellum_of[e]
+        if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
+            return
+        touch = real(0.05) * model.steric_diameter[c]
+        p1 = guard.position[e - 1]
+        q1 = guard.position[e]
+        p1n = state.position[e - 1]
+        q1n = state.position[e]
+        middle = real(0.5) * (p1n + q1n)
+        moved = wp.max(wp.length(p1n - p1), wp.length(q1n - q1))
+        first = model.first_node[k + 1]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        j = first
+        other = k + 1
+        while j < end:
+            if j == model.first_node[other + 1]:
+                other += 1
+            if j > model.first_node[other]:
+                p2n = state.position[j - 1]
+                q2n = state.position[j]
+                p2 = guard.position[j - 1]
+                q2 = guard.position[j]
+                away = middle - real(0.5) * (p2n + q2n)
+                reach = real(0.5) * (state.length[e] + state.length[j]) + touch
+                reach += moved + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
+                if wp.dot(away, away) < reach * reach:
+                    if crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
+                        wp.atomic_min(control.fault, c, crossing + e)
+            j += 1
+
+    @wp.kernel(module=module)
+    def remember(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        control: Control,
+        chart: Chart,
+        # Out:
+        guard: Guard,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0 and due(control, guard, chart, c):
+            guard.position[e] = state.position[e]
+
+    return SimpleNamespace(
+        check_elements=check_elements, check_crossings=check_crossings, remember=remember
+    )
+
+
+def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
+    """Looks at every completed step that is due and notes the first violated guard of each cell in `fault`."""
+    kernels = _kernels(model.precision)
+    inputs = [model.data, state.data, chart, guard, control]
+    wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
+    if model.flagellum_count > model.cell_count:
+        wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
+        inputs = [model.data, state.data, control, chart, guard]
+        wp.launch(kernels.remember, model.element_count, inputs=inputs, device=model.device)

@@ -1,0 +1,128 @@
+"""Drag and hydrodynamic coefficients of a scene: plain numbers that the device model is filled with.
+
+Local drag per unit length is the paper's (gamma_par, gamma_perp, gamma_R). A node carries the drag of h, the free end
+of h/2. The body moves by the mobility of a prolate spheroid of its aspect ratio (Kim & Karrila, Microhydrodynamics).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpflag.scene import Scene, SceneError
+
+__all__ = ["FilamentMobility", "SpheroidMobility", "filament_mobility", "pair_radius", "spheroid_mobility"]
+
+_WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
+_ZETA_3 = 1.2020569031595942
+
+
+@dataclass(frozen=True)
+class SpheroidMobility:
+    """Mobility of the body: translation along and across the axis [um/(s pN)], rotation about and across it
+    [1/(pN um s)]."""
+
+    along: float
+    across: float
+    spin: float
+    tumble: float
+
+
+@dataclass(frozen=True)
+class FilamentMobility:
+    """Mobility of a node that carries one segment length: along and across the tangent [um/(s pN)], and of a
+    segment's spin [1/(pN um s)]."""
+
+    along: float
+    across: float
+    spin: float
+
+
+def spheroid_mobility(length: float, width: float, viscosity: float) -> SpheroidMobility:
+    """Mobility of a prolate spheroid (Kim & Karrila, table 3.4); a sphere where length equals width.
+
+    Args:
+        length, width: axes of the spheroid, length >= width [um].
+        viscosity: of the fluid [pN s/um^2].
+    """
+    a = length / 2
+    e2 = 1.0 - (width / length) ** 2
+    translation, rotation = 6 * math.pi * viscosity * a, 8 * math.pi * viscosity * a**3
+    if e2 < 1e-4:  # the closed forms cancel here; first order in the eccentricity squared
+        xa, ya, xc, yc = 1 - 2 * e2 / 5, 1 - 3 * e2 / 10, 1 - 6 * e2 / 5, 1 - 9 * e2 / 10
+    else:
+        e = math.sqrt(e2)
+        log = math.log((1 + e) / (1 - e))
+        xa = 8 / 3 * e**3 / (-2 * e + (1 + e2) * log)
+        ya = 16 / 3 * e**3 / (2 * e + (3 * e2 - 1) * log)
+        xc = 4 / 3 * e**3 * (1 - e2) / (2 * e - (1 - e2) * log)
+        yc = 4 / 3 * e**3 * (2 - e2) / (-2 * e + (1 + e2) * log)
+    return SpheroidMobility(
+        1 / (translation * xa), 1 / (translation * ya), 1 / (rotation * xc), 1 / (rotation * yc)
+    )
+
+
+def pair_radius(scene: Scene) -> float:
+    """Radius a of the Rotne-Prager pair term [um].
+
+    As printed (the filament radius), a node's local mobility 1/(gamma_perp h) is below that of a bead of radius a
+    once h > 6 pi eta a/gamma_perp, and the mobility of two nodes in contact has a negative eigenvalue: they attract
+    where they should repel. With a = max(filament radius, gamma_perp h/(6 pi eta)) it is positive definite.
+    """
+    h = max(spec.segment_length for spec in scene.resolved_flagella())
+    radius, eta = scene.flagella.filament_radius, scene.fluid.viscosity
+    if scene.hydrodynamics.pair_radius is not None:
+        return scene.hydrodynamics.pair_radius
+    if scene.hydrodynamics.mode == "as_printed":
+        return radius
+    if scene.hydrodynamics.mode == "consistent":
+        return max(_consistent_radius(spec.segment_length, radius) for spec in scene.resolved_flagella())
+    return max(radius, _drag(scene)[1] * h / (6 * math.pi * eta))
+
+
+def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
+    """Local mobility of a node and of a segment's spin for segments of one length [um].
+
+    In mode "consistent" the local drag is what is left of slender-body theory once the pair sum carries the flow from
+    distances of h and more, so that nothing counts twice and the sum of both converges with h.
+    """
+    parallel, perpendicular, rotation = _drag(scene)
+    h = segment_length
+    if scene.hydrodynamics.mode != "consistent":
+        return FilamentMobility(1 / (parallel * h), 1 / (perpendicular * h), 1 / (rotation * h))
+    along, across = _slender_body(h, scene.flagella.filament_radius, pair_radius(scene))
+    scale = 1 / (4 * math.pi * scene.fluid.viscosity * h)
+    return FilamentMobility(scale * along, scale * across, 1 / (rotation * h))
+
+
+def _drag(scene: Scene) -> tuple[float, float, float]:
+    """gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s]; the paper's belong to water and scale with viscosity."""
+    fluid, scale = scene.fluid, scene.fluid.viscosity / _WATER
+    given = (fluid.drag_parallel, fluid.drag_perpendicular, fluid.drag_rotation)
+    printed = (1.6e-3, 2.8e-3, 1.26e-6)
+    values = [p * scale if g is None else g for g, p in zip(given, printed, strict=True)]
+    return values[0], values[1], values[2]
+
+
+def _slender_body(h: float, radius: float, a_pair: float) -> tuple[float, float]:
+    """Local mobility along and across a filament in units of 1/(4 pi eta h), Lighthill's theorem less the pair sum.
+
+    Lighthill (SIAM Rev. 18, 161 (1976)): u = f_n/(4 pi eta) + the flow of Stokeslets beyond delta = a sqrt(e)/2. On a
+    straight filament the pair sum over nodes n h gives the logarithm of that integral up to ln(h/delta) - 0.5772 per
+    side, and its a_pair^2/r^2 terms add up to zeta(3): both are corrected here.
+    """
+    delta = radius * math.sqrt(math.e) / 2
+    log = math.log(h / delta) - np.euler_gamma
+    ratio = (a_pair / h) ** 2 * _ZETA_3
+    return 2 * log + 4 / 3 * ratio, 1 + log - 2 / 3 * ratio
+
+
+def _consistent_radius(h: float, radius: float) -> float:
+    """Smallest pair radius that keeps the consistent mobility positive definite [um]."""
+    for a_pair in np.linspace(min(radius, h / 2), h / 2, 400):
+        if min(_slender_body(h, radius, a_pair)) >= 2 / 3 * h / a_pair:
+            return float(a_pair)
+    problem = f"must be at least about {2.6 * radius:.3g} um in mode consistent (2.6 filament radii)"
+    raise SceneError("flagella.segment_length", h, problem, ["hydrodynamics.mode"])
