@@ -59,9 +59,7 @@ def spheroid_mobility(length: float, width: float, viscosity: float) -> Spheroid
         ya = 16 / 3 * e**3 / (2 * e + (3 * e2 - 1) * log)
         xc = 4 / 3 * e**3 * (1 - e2) / (2 * e - (1 - e2) * log)
         yc = 4 / 3 * e**3 * (2 - e2) / (-2 * e + (1 + e2) * log)
-    return SpheroidMobility(
-        1 / (translation * xa), 1 / (translation * ya), 1 / (rotation * xc), 1 / (rotation * yc)
-    )
+    return SpheroidMobility(1 / (translation * xa), 1 / (translation * ya), 1 / (rotation * xc), 1 / (rotation * yc))
 
 
 def pair_radius(scene: Scene) -> float:

@@ -11,7 +11,7 @@ from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, Switches, structs
 
 from warpflag.drag import filament_mobility, pair_radius, spheroid_mobility
-from warpflag.geometry import InitialState
+from warpflag.geometry import InitialState, rotation_matrix
 from warpflag.scene import Scene, SceneError
 
 __all__ = ["build_chart", "build_model", "build_state", "switches_of"]
@@ -177,18 +177,6 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     chart.body_rate = zeros(cells, chart_stage.vec6d)
     chart.motor_angle, chart.body_angle = zeros(flagella, wp.float64), zeros(cells, wp.float64)
     return chart
-
-
-def rotation_matrix(q: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a unit quaternion (x, y, z, w), shape [3, 3]."""
-    x, y, z, w = np.asarray(q, dtype=np.float64)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _attachment(scenes: Sequence[Scene], flagella: Sequence[Any], owner: Sequence[int]) -> tuple[Any, Any]:

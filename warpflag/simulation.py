@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from warpflag_kernels import chart as chart_stage
 from warpflag_kernels import control as control_stage
 from warpflag_kernels import elastic, guard, steric
 from warpflag_kernels.types import Precision
@@ -17,8 +18,9 @@ from warpflag.geometry import InitialState, initial_state
 from warpflag.integrators import System, make_stepper
 from warpflag.model import build_chart, build_model, build_state
 from warpflag.scene import Scene
+from warpflag.stages import launch_right_hand_side
 
-__all__ = ["CellState", "NumericalError", "Simulation"]
+__all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
 _SECONDS_PER_REPLAY = 0.2
 
@@ -88,6 +90,29 @@ class CellState:
     body_orientation: np.ndarray
     elastic_energy: np.ndarray
     steric_force: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Forces and velocities of one cell at its present state.
+
+    Attributes:
+        forces: on the nodes [pN], shape [node_count, 3]; on r_0: what the anchor hands to the body.
+        torques: on the spins about the tangents [pN um], shape [node_count].
+        velocities: of the nodes in the lab [um/s], shape [node_count, 3].
+        spins: of the segments about their tangents [rad/s], shape [node_count].
+        body_force, body_torque: on the body, all shares [pN], [pN um], shape [3]; torque about its centre.
+        body_velocity, body_spin: of the body [um/s], [rad/s], shape [3].
+    """
+
+    forces: np.ndarray
+    torques: np.ndarray
+    velocities: np.ndarray
+    spins: np.ndarray
+    body_force: np.ndarray
+    body_torque: np.ndarray
+    body_velocity: np.ndarray
+    body_spin: np.ndarray
 
 
 class Simulation:
@@ -177,8 +202,7 @@ class Simulation:
     def cell_state(self, cell: int = 0) -> CellState:
         """One cell on the host, at the time it has reached; valid after `advance`."""
         s, chart, model = self.system.state, self.system.chart, self.system.model
-        flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
-        nodes = slice(self._first_node[flagella.start], self._first_node[flagella.stop])
+        flagella, nodes = self._own(cell)
         centre = chart.base_body_position.numpy()[cell]
         elastic.elastic_energy(model, s, self._energy)
         steric_force = 0.0
@@ -198,6 +222,38 @@ class Simulation:
             elastic_energy=self._energy.numpy()[nodes].sum(axis=0, dtype=np.float64),
             steric_force=steric_force,
         )
+
+    def evaluate(self, cell: int = 0) -> Evaluation:
+        """Forces and velocities of one cell at its present state; advances nothing."""
+        model, s, chart = self.system.model, self.system.state, self.system.chart
+        s.data.active.fill_(1)
+        for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
+            array.zero_()
+        chart_stage.place(model, s, chart)
+        launch_right_hand_side(model, s)
+        s.data.active.zero_()
+        flagella, nodes = self._own(cell)
+
+        def host(array: Any, part: Any) -> np.ndarray:
+            return array.numpy()[part].astype(np.float64)
+
+        torques = host(s.data.spin_torque, nodes)
+        mobility = np.repeat(model.data.spin_mobility.numpy(), np.diff(self._first_node))[nodes]
+        return Evaluation(
+            forces=host(s.data.force, nodes),
+            torques=torques,
+            velocities=host(s.data.velocity, nodes),
+            spins=mobility * torques,
+            body_force=host(s.data.flagellum_force, flagella).sum(axis=0),
+            body_torque=host(s.data.flagellum_torque, flagella).sum(axis=0),
+            body_velocity=host(s.data.body_velocity, cell),
+            body_spin=host(s.data.body_spin, cell),
+        )
+
+    def _own(self, cell: int) -> tuple[slice, slice]:
+        """The flagella and the nodes of one cell."""
+        flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
+        return flagella, slice(self._first_node[flagella.start], self._first_node[flagella.stop])
 
     def _replay(self) -> None:
         control = self.system.control

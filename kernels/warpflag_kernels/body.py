@@ -66,12 +66,11 @@ def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNa
         axis = state.body_axis[c]
         force_along = wp.dot(axis, force) * axis
         torque_along = wp.dot(axis, torque) * axis
-        state.body_velocity[c] = (
-            model.body_mobility_along[c] * force_along + model.body_mobility_across[c] * (force - force_along)
+        state.body_velocity[c] = model.body_mobility_along[c] * force_along + model.body_mobility_across[c] * (
+            force - force_along
         )
-        state.body_spin[c] = (
-            model.body_spin_mobility[c] * torque_along
-            + model.body_tumble_mobility[c] * (torque - torque_along)
+        state.body_spin[c] = model.body_spin_mobility[c] * torque_along + model.body_tumble_mobility[c] * (
+            torque - torque_along
         )
 
     return SimpleNamespace(sum_flagellum=sum_flagellum, move=move)

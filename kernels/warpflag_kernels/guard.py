@@ -110,9 +110,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         return wp.dot(wp.cross(q1 - p1, q2 - p2), p2 - p1)
 
     @wp.func(module=module)
-    def crossed(
-        p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real
-    ):
+    def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
         """Whether two segments pass through each other while their ends move linearly to the new places."""
         before = volume(p1, q1, p2, q2)
         after = volume(p1n, q1n, p2n, q2n)
@@ -122,9 +120,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         high = real(1.0)
         for _step in range(24):
             x = real(0.5) * (low + high)
-            v = volume(
-                p1 + x * (p1n - p1), q1 + x * (q1n - q1), p2 + x * (p2n - p2), q2 + x * (q2n - q2)
-            )
+            v = volume(p1 + x * (p1n - p1), q1 + x * (q1n - q1), p2 + x * (p2n - p2), q2 + x * (q2n - q2))
             if (v > real(0.0)) == (before > real(0.0)):
                 low = x
             else:
@@ -198,9 +194,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] != 0 and due(control, guard, chart, c):
             guard.position[e] = state.position[e]
 
-    return SimpleNamespace(
-        check_elements=check_elements, check_crossings=check_crossings, remember=remember
-    )
+    return SimpleNamespace(check_elements=check_elements, check_crossings=check_crossings, remember=remember)
 
 
 def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:

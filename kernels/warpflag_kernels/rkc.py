@@ -151,12 +151,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         rate = chart.body_rate[c]
         if j == 1:
             rate = rkc.body_start_rate[c]
-        y = (
-            mu * previous
-            + nu * rkc.body_before_previous[c]
-            + (m * dt) * rate
-            + (g * dt) * rkc.body_start_rate[c]
-        )
+        y = mu * previous + nu * rkc.body_before_previous[c] + (m * dt) * rate + (g * dt) * rkc.body_start_rate[c]
         rkc.body_before_previous[c] = previous
         rkc.body_previous[c] = y
         chart.body_increment[c] = y
@@ -280,9 +275,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     return SimpleNamespace(schedule=schedule, combine=combine, keep=keep, turn_over=turn_over)
 
 
-def begin_pass(
-    model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool
-) -> None:
+def begin_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
     inputs = [model.data, state.data, control, rkc, chart]
@@ -291,9 +284,7 @@ def begin_pass(
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
 
 
-def end_pass(
-    model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool
-) -> None:
+def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
     """Keeps what later stages need and moves every cell's clockwork on."""
     kernels = _kernels(model.precision, euler)
     inputs = [model.data, state.data, chart, rkc]

@@ -64,9 +64,7 @@ class Precision:
         """Warp module of one stage in this precision; a variant is a set of switches compiled in."""
         parts = ["warpflag_kernels", stage, self.name, "strict" if self.strict else "fast", variant]
         module = wp.get_module(".".join(part for part in parts if part))
-        module.options.update(
-            {"enable_backward": False, "cpu_compiler_flags": self.cpu_flags, "fast_math": False}
-        )
+        module.options.update({"enable_backward": False, "cpu_compiler_flags": self.cpu_flags, "fast_math": False})
         return module
 
 

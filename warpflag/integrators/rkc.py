@@ -55,9 +55,7 @@ class RkcStepper:
             return wp.zeros(count, dtype=dtype, device=device)
 
         r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
-        r.body_previous, r.body_before_previous, r.body_start_rate = (
-            zeros(cells, chart.vec6d) for _ in range(3)
-        )
+        r.body_previous, r.body_before_previous, r.body_start_rate = (zeros(cells, chart.vec6d) for _ in range(3))
         r.stage, r.stages, r.probes_left = (zeros(cells, wp.int32) for _ in range(3))
         r.evaluations = zeros(cells, wp.int32)
         r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)

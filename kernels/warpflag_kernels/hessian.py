@@ -1,0 +1,176 @@
+"""Second derivatives of the elastic energy, assembled into the band of one flagellum.
+
+A joint sees two segment vectors e, f and their spins. With W = m1 w1 + m2 w2 the bending moments' share and S_e, S_f
+the directors weighted by the moments, the closed forms below are those of discrete elastic rods (Bergou 2010),
+written for directors that follow their tangents. They are the symmetric part: the antisymmetric one is half the net
+spin torque of a segment, which its tiny spin drag keeps near zero.
+
+Unknowns of element i are (node increment, spin increment). A joint reaches from element i - 2 to i, so the matrix has
+half bandwidth 11; rows of r_0, which moves with the body, are unit rows and its columns go to the body's block.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels import frames
+from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
+
+BAND = 12  # stored entries of a row: columns row - 11 .. row
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Stiffness`: second derivatives per joint with respect to (e, f, spin of e, spin of f)."""
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+
+    @wp.struct
+    class Stiffness:
+        ee: wp.array(dtype=mat33)  # [E] [pN/um]
+        ff: wp.array(dtype=mat33)  # [E]
+        fe: wp.array(dtype=mat33)  # [E], rows f, columns e
+        e_first: wp.array(dtype=vec3)  # [E], e with the spin of e [pN]
+        e_second: wp.array(dtype=vec3)  # [E], e with the spin of f
+        f_first: wp.array(dtype=vec3)  # [E]
+        f_second: wp.array(dtype=vec3)  # [E]
+        spins: wp.array(dtype=vec3)  # [E]: first-first, first-second, second-second [pN um]
+        stretch: wp.array(dtype=mat33)  # [E], of segment i [pN/um]
+        band: wp.array(dtype=real)  # [E * 4 * BAND], row-wise
+
+    return Stiffness
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    Model, State, Stiffness = structs(p).Model, structs(p).State, struct(p)
+    twist_angle = frames.functions(p).twist_angle
+    module = p.module("hessian")
+
+    @wp.func(module=module)
+    def symmetric(a: vec3, b: vec3):
+        return wp.outer(a, b) + wp.outer(b, a)
+
+    @wp.kernel(module=module)
+    def joints(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        stiffness: Stiffness,
+    ):
+        i = wp.tid()
+        if state.active[model.cell_of[i]] == 0:
+            return
+        k = model.flagellum_of[i]
+        first = model.first_node[k]
+        h = model.segment_length[k]
+        t = state.tangent[i]
+        le = state.length[i]
+        identity = wp.identity(3, dtype=real)
+        tt = wp.outer(t, t)
+        if i > first:
+            stretching = model.stretching_stiffness[k]
+            strain = le / h - real(1.0)
+            stiffness.stretch[i] = (stretching / h) * tt + (stretching * strain / le) * (identity - tt)
+        if i + 1 == model.first_node[k + 1]:
+            return
+        u = state.tangent[i + 1]
+        lf = state.length[i + 1]
+        a1 = state.director[i]
+        b1 = state.director[i + 1]
+        chi = real(1.0) + wp.dot(t, u)
+        kb = wp.cross(t, u) * (real(2.0) / chi)
+        tm = (t + u) / chi
+        twist = twist_angle(t, u, a1, b1)
+        half = real(0.5)
+        quarter = real(0.25)
+        c3 = model.twist_rigidity[k] / h
+        w3 = twist - model.rest_strain[k][2]
+        if i == first:
+            c3 = model.hook_rigidity[k] / h
+            w3 = twist
+        m3 = c3 * w3
+        # Twist.
+        te = t + tm
+        tf = u + tm
+        cc = c3 * quarter
+        kk = wp.outer(kb, kb)
+        ee = cc * kk - (m3 * quarter) * symmetric(kb, te)
+        ff = cc * kk - (m3 * quarter) * symmetric(kb, tf)
+        fe = cc * kk - (m3 / chi) * wp.skew(t) - (m3 * half) * wp.outer(tm, kb)
+        e_spin = (half * c3) * kb
+        e1 = -e_spin
+        e2 = e_spin
+        f1 = -e_spin
+        f2 = e_spin
+        s11 = c3
+        s12 = -c3
+        s22 = c3
+        if i > first:
+            a2 = wp.cross(t, a1)
+            b2 = wp.cross(u, b1)
+            c = model.bending_rigidity[k] / h
+            w1 = half * wp.dot(kb, a1 + b1)
+            w2 = half * wp.dot(kb, a2 + b2)
+            m1 = c * (w1 - model.rest_strain[k][0])
+            m2 = c * (w2 - model.rest_strain[k][1])
+            d1 = (a1 + b1) / chi
+            d2 = (a2 + b2) / chi
+            # Gradients of w1, w2 with respect to e and f, times the segment's length.
+            g1e = wp.cross(u, d1) - w1 * tm
+            g2e = wp.cross(u, d2) - w2 * tm
+            g1f = -wp.cross(t, d1) - w1 * tm
+            g2f = -wp.cross(t, d2) - w2 * tm
+            # ... and to the spins.
+            ka1 = half * wp.dot(kb, a1)
+            ka2 = half * wp.dot(kb, a2)
+            kb1 = half * wp.dot(kb, b1)
+            kb2 = half * wp.dot(kb, b2)
+            big_w = m1 * w1 + m2 * w2
+            se = m1 * a1 + m2 * a2
+            sf = m1 * b1 + m2 * b2
+            sm = (se + sf) / chi
+            us = wp.cross(u, sm)
+            ts = wp.cross(t, sm)
+            tmtm = wp.outer(tm, tm)
+            ee += c * (wp.outer(g1e, g1e) + wp.outer(g2e, g2e))
+            ee += (real(2.0) * big_w) * tmtm - symmetric(us, tm) - (big_w / chi) * (identity - tt)
+            ee += quarter * symmetric(kb, se)
+            ff += c * (wp.outer(g1f, g1f) + wp.outer(g2f, g2f))
+            ff += (real(2.0) * big_w) * tmtm + symmetric(ts, tm)
+            ff += quarter * symmetric(kb, sf) - (big_w / chi) * (identity - wp.outer(u, u))
+            fe += c * (wp.outer(g1f, g1e) + wp.outer(g2f, g2e))
+            fe += (real(2.0) * big_w) * tmtm - wp.outer(tm, us) + wp.outer(ts, tm) + wp.skew(sm)
+            fe -= (big_w / chi) * (identity + wp.outer(u, t))
+            # Spins: a turn takes e1 to e2 and e2 to -e1.
+            ra = m1 * a2 - m2 * a1
+            rb = m1 * b2 - m2 * b1
+            kra = half * wp.dot(kb, ra)
+            krb = half * wp.dot(kb, rb)
+            e1 += c * (ka2 * g1e - ka1 * g2e) - kra * tm + wp.cross(u, ra) / chi
+            e2 += c * (kb2 * g1e - kb1 * g2e) - krb * tm + wp.cross(u, rb) / chi
+            f1 += c * (ka2 * g1f - ka1 * g2f) - kra * tm - wp.cross(t, ra) / chi
+            f2 += c * (kb2 * g1f - kb1 * g2f) - krb * tm - wp.cross(t, rb) / chi
+            s11 += c * (ka2 * ka2 + ka1 * ka1) - half * wp.dot(kb, se)
+            s12 += c * (ka2 * kb2 + ka1 * kb1)
+            s22 += c * (kb2 * kb2 + kb1 * kb1) - half * wp.dot(kb, sf)
+        stiffness.ee[i] = ee / (le * le)
+        stiffness.ff[i] = ff / (lf * lf)
+        stiffness.fe[i] = fe / (le * lf)
+        stiffness.e_first[i] = e1 / le
+        stiffness.e_second[i] = e2 / le
+        stiffness.f_first[i] = f1 / lf
+        stiffness.f_second[i] = f2 / lf
+        stiffness.spins[i] = vec3(s11, s12, s22)
+
+    return SimpleNamespace(joints=joints)
+
+
+def joint_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
+    """Second derivatives of the elastic energy at every joint, into `stiffness`."""
+    kernel = _kernels(model.precision).joints
+    wp.launch(kernel, model.element_count, inputs=[model.data, state.data, stiffness], device=model.device)
