@@ -11,7 +11,7 @@ from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, Switches, structs
 
 from warpflag.drag import filament_mobility, pair_radius, spheroid_mobility
-from warpflag.geometry import InitialState, rotation_matrix
+from warpflag.geometry import InitialState
 from warpflag.scene import Scene, SceneError
 
 __all__ = ["build_chart", "build_model", "build_state", "switches_of"]
@@ -147,7 +147,7 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     positions, tangents, directors = [], [], []
     axes, first_flagellum = model.data.motor_axis.numpy().astype(np.float64), model.data.first_flagellum.numpy()
     for c, start in enumerate(starts):
-        rotation = rotation_matrix(start.body_orientation)
+        rotation = _lab_axes(start.body_orientation)
         for k, (nodes, e1) in enumerate(zip(start.positions, start.directors, strict=True)):
             segments = np.diff(nodes, axis=0)
             t = segments / np.linalg.norm(segments, axis=1, keepdims=True)
@@ -177,6 +177,18 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     chart.body_rate = zeros(cells, chart_stage.vec6d)
     chart.motor_angle, chart.body_angle = zeros(flagella, wp.float64), zeros(cells, wp.float64)
     return chart
+
+
+def _lab_axes(q: np.ndarray) -> np.ndarray:
+    """Body axes in the lab as columns, of the orientation quaternion (x, y, z, w), shape [3, 3]."""
+    x, y, z, w = np.asarray(q, dtype=np.float64)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _attachment(scenes: Sequence[Scene], flagella: Sequence[Any], owner: Sequence[int]) -> tuple[Any, Any]:
