@@ -10,6 +10,8 @@ from types import SimpleNamespace
 import warp as wp
 
 NO_FAULT = 2**31 - 1
+# Of a step: what is closer to the target than this counts as reaching it.
+STEP_TOLERANCE = 1.0e-6
 
 
 @wp.struct

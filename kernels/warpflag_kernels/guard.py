@@ -1,9 +1,10 @@
 """Guards: finite values, strain, twist and fold of every joint, crossed centre lines.
 
-A step too long, or a load too strong, gives finite garbage long before it gives NaN. So whenever a step is complete
-(every `interval` steps) these kernels look at the new state and note the first violated guard of the cell; the
+A step too long, or a load too strong, gives finite garbage long before it gives NaN. So at a start, every `interval`
+steps and where an advance ends, these kernels look at the state and note the first violated guard of the cell; the
 stepper then stops that cell. Crossings are found by following both segments of a near pair linearly from the last
-check to this one: where the four end points become coplanar, do the segments touch?
+check to this one: where the four end points become coplanar, do the segments touch? Flagella without steric forces
+may pass through each other.
 """
 
 import functools
@@ -15,7 +16,7 @@ import warp as wp
 
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels import frames, steric
-from warpflag_kernels.control import Control
+from warpflag_kernels.control import STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LARGEST_STRAIN = 0.05
@@ -32,6 +33,7 @@ class Fault(IntEnum):
     STRAIN = 2
     TWIST = 3
     FOLD = 4
+    UNSOLVED = 5
 
 
 def encode(kind: Fault) -> int:
@@ -65,13 +67,18 @@ def _kernels(p: Precision) -> SimpleNamespace:
     twist_angle = frames.functions(p).twist_angle
     closest_parameters = steric.functions(p).closest_parameters
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     module = p.module("guard")
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
-        return chart.commit[c] != 0 and (control.steps[c] + 1) % guard.interval[c] == 0
+        if chart.rest[c] == 0:
+            return False
+        left = control.target[c] - (control.time[c] + control.step[c])
+        ends = left < tolerance * control.step[c]
+        return chart.commit[c] == 0 or ends or (control.steps[c] + 1) % guard.interval[c] == 0
 
     @wp.kernel(module=module)
     def check_elements(
@@ -90,7 +97,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         k = model.flagellum_of[e]
         x = state.position[e]
-        if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e])):
+        director = state.director[e]
+        # Normalising turns a director that is not finite into zero.
+        directed = wp.dot(director, director) > real(0.5)
+        if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e]) and directed):
             wp.atomic_min(control.fault, c, not_finite + e)
             return
         if e > model.first_node[k]:
@@ -105,33 +115,58 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 wp.atomic_min(control.fault, c, twisted + e)
 
     @wp.func(module=module)
-    def volume(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
-        """Six times the signed volume of the tetrahedron of two segments' end points."""
-        return wp.dot(wp.cross(q1 - p1, q2 - p2), p2 - p1)
+    def distance(p1: vec3, d1: vec3, p2: vec3, d2: vec3):
+        """Distance of segments p1 + s d1 and p2 + t d2 [um]."""
+        st = closest_parameters(p1, d1, p2, d2)
+        return wp.length(p1 + st[0] * d1 - p2 - st[1] * d2)
 
     @wp.func(module=module)
     def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
         """Whether two segments pass through each other while their ends move linearly to the new places."""
-        before = volume(p1, q1, p2, q2)
-        after = volume(p1n, q1n, p2n, q2n)
-        if (before > real(0.0)) == (after > real(0.0)):
+        zero, one = real(0.0), real(1.0)
+        moved = wp.max(wp.length(p1n - p1), wp.length(q1n - q1)) + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
+        if distance(p1n, q1n - p1n, p2n, q2n - p2n) > moved + touch:
             return False
-        low = real(0.0)
-        high = real(1.0)
-        for _step in range(24):
-            x = real(0.5) * (low + high)
-            v = volume(p1 + x * (p1n - p1), q1 + x * (q1n - q1), p2 + x * (p2n - p2), q2 + x * (q2n - q2))
-            if (v > real(0.0)) == (before > real(0.0)):
-                low = x
-            else:
-                high = x
-        x = real(0.5) * (low + high)
-        a = p1 + x * (p1n - p1)
-        b = p2 + x * (p2n - p2)
-        da = q1 + x * (q1n - q1) - a
-        db = q2 + x * (q2n - q2) - b
-        st = closest_parameters(a, da, b, db)
-        return wp.length(a + st[0] * da - b - st[1] * db) < touch
+        # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; looking
+        # at its sign before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
+        a, b, r = q1 - p1, q2 - p2, p2 - p1
+        da, db, dr = q1n - p1n - a, q2n - p2n - b, p2n - p1n - r
+        mixed = wp.cross(a, db) + wp.cross(da, b)
+        c0 = wp.dot(wp.cross(a, b), r)
+        c1 = wp.dot(mixed, r) + wp.dot(wp.cross(a, b), dr)
+        c2 = wp.dot(wp.cross(da, db), r) + wp.dot(mixed, dr)
+        c3 = wp.dot(wp.cross(da, db), dr)
+        first, second = one, one
+        discriminant = c2 * c2 - real(3.0) * c3 * c1
+        if discriminant > zero:
+            root = wp.where(c2 < zero, wp.sqrt(discriminant) - c2, -wp.sqrt(discriminant) - c2)
+            if root != zero:
+                first = wp.clamp(c1 / root, zero, one)
+                if c3 != zero:
+                    second = wp.clamp(root / (real(3.0) * c3), zero, one)
+        begin = zero
+        for bracket in range(3):
+            end = one
+            if bracket == 0:
+                end = wp.min(first, second)
+            elif bracket == 1:
+                end = wp.max(first, second)
+            low, high = begin, end
+            before = c0 + low * (c1 + low * (c2 + low * c3))
+            after = c0 + high * (c1 + high * (c2 + high * c3))
+            if (before > zero) != (after > zero):
+                for _step in range(24):
+                    x = real(0.5) * (low + high)
+                    v = c0 + x * (c1 + x * (c2 + x * c3))
+                    if (v > zero) == (before > zero):
+                        low = x
+                    else:
+                        high = x
+                x = real(0.5) * (low + high)
+                if distance(p1 + x * (p1n - p1), a + x * da, p2 + x * (p2n - p2), b + x * db) < touch:
+                    return True
+            begin = end
+        return False
 
     @wp.kernel(module=module)
     def check_crossings(
@@ -146,8 +181,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         e = wp.tid()
         c = model.cell_of[e]
-        if state.active[c] == 0 or not due(control, guard, chart, c):
-            return
+        if state.active[c] == 0 or chart.commit[c] == 0 or not due(control, guard, chart, c):
+            return  # a start has no earlier place to come from
         k = model.flagellum_of[e]
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
@@ -202,7 +237,12 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
-    if model.flagellum_count > model.cell_count:
+    if model.switches.steric:
         wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
+
+
+def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
+    """Keeps the checked pose: the next check looks for crossings since then."""
+    if model.flagellum_count > model.cell_count:
         inputs = [model.data, state.data, control, chart, guard]
-        wp.launch(kernels.remember, model.element_count, inputs=inputs, device=model.device)
+        wp.launch(_kernels(model.precision).remember, model.element_count, inputs=inputs, device=model.device)

@@ -1,12 +1,9 @@
-"""Second derivatives of the elastic energy, assembled into the band of one flagellum.
+"""Second derivatives of the elastic energy of every joint and segment.
 
 A joint sees two segment vectors e, f and their spins. With W = m1 w1 + m2 w2 the bending moments' share and S_e, S_f
 the directors weighted by the moments, the closed forms below are those of discrete elastic rods (Bergou 2010),
 written for directors that follow their tangents. They are the symmetric part: the antisymmetric one is half the net
 spin torque of a segment, which its tiny spin drag keeps near zero.
-
-Unknowns of element i are (node increment, spin increment). A joint reaches from element i - 2 to i, so the matrix has
-half bandwidth 11; rows of r_0, which moves with the body, are unit rows and its columns go to the body's block.
 """
 
 import functools
@@ -18,13 +15,11 @@ import warp as wp
 from warpflag_kernels import frames
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-BAND = 12  # stored entries of a row: columns row - 11 .. row
-
 
 @functools.cache
 def struct(p: Precision) -> Any:
     """The struct `Stiffness`: second derivatives per joint with respect to (e, f, spin of e, spin of f)."""
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    vec3, mat33 = p.vec3, p.mat33
 
     @wp.struct
     class Stiffness:
@@ -37,14 +32,13 @@ def struct(p: Precision) -> Any:
         f_second: wp.array(dtype=vec3)  # [E]
         spins: wp.array(dtype=vec3)  # [E]: first-first, first-second, second-second [pN um]
         stretch: wp.array(dtype=mat33)  # [E], of segment i [pN/um]
-        band: wp.array(dtype=real)  # [E * 4 * BAND], row-wise
 
     return Stiffness
 
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
-    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    real, vec3 = p.real, p.vec3
     Model, State, Stiffness = structs(p).Model, structs(p).State, struct(p)
     twist_angle = frames.functions(p).twist_angle
     module = p.module("hessian")

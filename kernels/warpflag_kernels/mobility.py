@@ -18,6 +18,27 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
+def pair_flow(p: Precision):
+    """Device function: 8 pi eta times the Rotne-Prager flow at distance vector d from a force, radius a."""
+    real, vec3 = p.real, p.vec3
+
+    @wp.func(module=p.module("mobility_functions"))
+    def rotne_prager(d: vec3, force: vec3, a: real):
+        r2 = wp.dot(d, d)
+        r = wp.sqrt(r2)
+        along = wp.dot(d, force) * d
+        if r > real(2.0) * a:
+            q = a * a / r2
+            return ((real(1.0) + real(2.0) / real(3.0) * q) * force + ((real(1.0) - real(2.0) * q) / r2) * along) / r
+        near = (real(4.0) / real(3.0) - real(0.375) * r / a) / a * force
+        if r > real(0.0):
+            near += along / (real(8.0) * a * a * r)
+        return near
+
+    return rotne_prager
+
+
+@functools.cache
 def _kernel(p: Precision, pairs: str):
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
@@ -54,7 +75,7 @@ def _kernel(p: Precision, pairs: str):
             safe = wp.where(r2 > real(0.0), r2, real(1.0))
             inv_r2 = real(1.0) / safe
             inv_r = wp.sqrt(inv_r2)
-            r = safe * inv_r
+            r = r2 * inv_r  # zero, not one, where two nodes coincide
             q = a2 * inv_r2
             far_i = inv_r * (real(1.0) + real(2.0) / real(3.0) * q)
             far_d = inv_r * inv_r2 * (real(1.0) - real(2.0) * q)

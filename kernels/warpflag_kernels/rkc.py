@@ -20,7 +20,7 @@ import warp as wp
 
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.chart import vec6d
-from warpflag_kernels.control import NO_FAULT, Control
+from warpflag_kernels.control import NO_FAULT, STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 DAMPING = 2.0 / 13.0
@@ -29,6 +29,8 @@ PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 SAFETY = 1.15
 FIRST_PROBES = 40
+# A state this stiff is past saving: the step is taken, unstable, and the guards stop the cell.
+MOST_STAGES = 1.0e4
 
 
 @functools.cache
@@ -67,7 +69,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
     safety = wp.constant(wp.float64(SAFETY))
     stage_factor = wp.constant(wp.float64(1.54))
-    tolerance = wp.constant(wp.float64(1.0e-6))
+    most_stages = wp.constant(wp.float64(MOST_STAGES))
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
 
     @wp.func(module=module)
@@ -110,7 +113,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
                 rkc.stages[c] = 1
             else:
                 stiffness = safety * rkc.spectral_radius[c] * control.step[c]
-                rkc.stages[c] = 1 + wp.max(wp.int32(wp.sqrt(one + stage_factor * stiffness)), 1)
+                wanted = wp.min(wp.sqrt(one + stage_factor * stiffness), most_stages)
+                rkc.stages[c] = 1 + wp.max(wp.int32(wanted), 1)
         s = rkc.stages[c]
         dt = control.step[c]
         chart.commit[c] = wp.where(j == s, 1, 0)
@@ -245,16 +249,17 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         j = rkc.stage[c]
         if chart.rest[c] != 0:
             rkc.body_start_rate[c] = chart.body_rate[c]
+            t = control.time[c]
             if chart.commit[c] != 0:
                 control.steps[c] += 1
-                t = control.time[c] + control.step[c]
+                t += control.step[c]
                 # Steps divide what is left evenly, so the last one ends on the target itself.
                 if control.target[c] - t < tolerance * control.step[c]:
                     t = control.target[c]
                 control.time[c] = t
-                if t >= control.target[c] or control.fault[c] != no_fault:
-                    state.active[c] = 0
-                    wp.atomic_sub(control.unfinished, 0, 1)
+            if t >= control.target[c] or control.fault[c] != no_fault:
+                state.active[c] = 0
+                wp.atomic_sub(control.unfinished, 0, 1)
             rkc.stage[c] = wp.static(1 if euler else 0)
         elif j == 0:
             total = wp.float64(0.0)

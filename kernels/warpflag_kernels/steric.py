@@ -46,6 +46,19 @@ def functions(p: Precision) -> SimpleNamespace:
         return strength * y6 * y * (real(2.0) * y6 - real(1.0))
 
     @wp.func(module=p.module("steric_functions"))
+    def steric_stiffness(r: real, strength: real, diameter: real):
+        """-dF/dr at distance r [pN/um]."""
+        x = r / diameter
+        if x >= cutoff:
+            return real(0.0)
+        if x < linear_below:
+            return strength / diameter * slope_there
+        y = real(1.0) / x
+        y2 = y * y
+        y6 = y2 * y2 * y2
+        return strength / diameter * y6 * y2 * (real(26.0) * y6 - real(7.0))
+
+    @wp.func(module=p.module("steric_functions"))
     def closest_parameters(p1: vec3, d1: vec3, p2: vec3, d2: vec3):
         """Parameters in [0, 1] of the closest points of segments p1 + s d1 and p2 + t d2."""
         zero, one = real(0.0), real(1.0)
@@ -68,7 +81,9 @@ def functions(p: Precision) -> SimpleNamespace:
             s = wp.clamp((b - c) / a, zero, one)
         return vec2(s, t)
 
-    return SimpleNamespace(steric_force=steric_force, closest_parameters=closest_parameters, vec2=vec2)
+    return SimpleNamespace(
+        steric_force=steric_force, steric_stiffness=steric_stiffness, closest_parameters=closest_parameters, vec2=vec2
+    )
 
 
 @functools.cache

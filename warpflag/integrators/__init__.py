@@ -19,9 +19,12 @@ def make_stepper(system: System, scenes: Sequence[Scene]) -> Stepper:
     Errors:
         SceneError: the scenes of a batch ask for different ones.
     """
+    from warpflag.integrators.implicit import ImplicitStepper
     from warpflag.integrators.rkc import RkcStepper
 
     names = {scene.numerics.stepper for scene in scenes}
     if len(names) != 1:
         raise SceneError("numerics.stepper", sorted(names), "must be the same in every scene of a batch")
+    if names == {"implicit"}:
+        return ImplicitStepper(system, scenes)
     return RkcStepper(system, scenes, euler=names == {"euler"})

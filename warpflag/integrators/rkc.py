@@ -76,6 +76,7 @@ class RkcStepper:
             chart.fit_flagellum_spin(s.model, s.state, s.chart)
         chart.increment_rates(s.model, s.state, s.chart)
         guard.check(s.model, s.state, s.chart, s.guard, s.control)
+        guard.remember(s.model, s.state, s.chart, s.guard, s.control)
         rkc.end_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
         control.count_pass(s.control, s.model.device)
 
@@ -85,13 +86,12 @@ class RkcStepper:
         self.data.probes_left.fill_(rkc.FIRST_PROBES)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("probe", "probe_norm", "spectral_radius", "evaluations")
+        names = ("probe", "probe_norm", "probes_left", "spectral_radius", "evaluations")
         return {name: getattr(self.data, name).numpy() for name in names}
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         for name, values in memory.items():
             getattr(self.data, name).assign(values)
-        self.data.probes_left.fill_(1)
 
     def _seed_probe(self) -> None:
         """A direction with a share of every mode: random, but the same in every run and every cell."""

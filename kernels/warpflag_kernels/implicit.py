@@ -1,0 +1,320 @@
+"""Linearly implicit stepping of second order: variable-step BDF2 around an extrapolated state.
+
+With delta the last increment, w = dt/dt_last, A = (1 + 2w)/(1 + w) and g = 1/A, a step extrapolates by x = w delta,
+evaluates the velocities V there once, and solves for the correction e:
+
+    (1/dt + g M H) e = g [V - w delta/dt] + contact forces
+
+in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
+the explicit flows of the pair sum stable. Contact forces are those of the exact law at the end of the step. Every
+step is checked before it is taken: solves, guards and the error estimate. A step that fails is taken again, shorter.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels import banded, chain, contacts, response
+from warpflag_kernels import chart as chart_stage
+from warpflag_kernels.control import NO_FAULT, Control
+from warpflag_kernels.guard import Fault, encode
+from warpflag_kernels.types import Precision, structs
+
+LARGEST_GROWTH = 1.9  # of the step from one to the next; BDF2 is stable below 1 + sqrt(2)
+SMALLEST_STEP = 1.0e-13  # [s]; a step that fails here ends the cell's run
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Implicit`: the clockwork of every cell, per cell [C] unless said otherwise."""
+    real = p.real
+
+    @wp.struct
+    class Implicit:
+        tolerance: wp.array(dtype=wp.float64)  # error per simulated time [um/s]; 0: fixed step
+        over_implicit: wp.array(dtype=wp.float64)
+        wanted_step: wp.array(dtype=wp.float64)  # [s]
+        last_step: wp.array(dtype=wp.float64)  # [s]
+        step_before: wp.array(dtype=wp.float64)  # [s]
+        history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
+        ratio: wp.array(dtype=wp.float64)  # w
+        one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
+        error: wp.array(dtype=real)  # [K], largest node error estimate [um]
+        accepted: wp.array(dtype=wp.int32)
+        rejected: wp.array(dtype=wp.int32)  # steps taken again so far
+        evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
+
+    return Implicit
+
+
+@functools.cache
+def kernels(p: Precision) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    Model, State = structs(p).Model, structs(p).State
+    Chart, Implicit = chart_stage.struct(p), struct(p)
+    Band, Contacts = banded.types(p).Band, contacts.struct(p)
+    Response = response.types(p).Response
+    Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
+    module = p.module("implicit")
+    no_fault = wp.constant(wp.int32(NO_FAULT))
+    unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
+    growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
+
+    @wp.kernel(module=module)
+    def begin(
+        # State:
+        state: State,
+        control: Control,
+        # Out:
+        imp: Implicit,
+        band: Band,
+        contacts_out: Contacts,
+        response_out: Response,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        one = wp.float64(1.0)
+        left = control.target[c] - control.time[c]
+        dt = wp.min(imp.wanted_step[c], control.longest_step[c])
+        if dt > left * wp.float64(0.999999):
+            dt = left
+        elif dt > wp.float64(0.5) * left:
+            dt = wp.float64(0.5) * left
+        w = wp.float64(0.0)
+        if imp.history[c] > 0:
+            w = dt / imp.last_step[c]
+        g = (one + w) / (one + wp.float64(2.0) * w)
+        control.step[c] = dt
+        imp.ratio[c] = w
+        band.step[c] = dt
+        band.weight[c] = g * imp.over_implicit[c]
+        band.singular[c] = 0
+        response_out.gain[c] = g
+        response_out.failed[c] = 0
+        contacts_out.overflow[c] = 0
+        imp.evaluations[c] += 1
+
+    @wp.kernel(module=module)
+    def right_hand_side(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        band: Band,
+        response_in: Response,
+        last: Increment,
+        # Out:
+        x: Increment,
+        zero: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        gain = real(response_in.gain[c])
+        slope = real(imp.ratio[c] / band.step[c])
+        carried = last.node[e]
+        zero.node[e] = vec4(real(0.0))
+        spin = gain * (model.spin_mobility[k] * state.spin_torque[e] - slope * carried[3])
+        v = vec3(real(0.0))
+        if e > model.first_node[k]:
+            v = gain * (state.velocity[e] - slope * vec3(carried[0], carried[1], carried[2]))
+            t = state.tangent[e]
+            if e + 1 < model.first_node[k + 1]:
+                t = wp.normalize(t + state.tangent[e + 1])
+            along = wp.dot(t, v) * t
+            v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+        elif k == model.first_flagellum[c]:
+            u = state.body_velocity[c]
+            w = state.body_spin[c]
+            rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
+            x.body[c] = gain * (rate - slope * last.body[c])
+            zero.body[c] = vec6(real(0.0))
+        x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+
+    @wp.kernel(module=module)
+    def add_increments(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        last: Increment,
+        x: Increment,
+        # Out:
+        total: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        w = real(imp.ratio[c])
+        total.node[e] = w * last.node[e] + x.node[e]
+        if e == model.first_node[model.first_flagellum[c]]:
+            total.body[c] = w * last.body[c] + x.body[c]
+
+    @wp.kernel(module=module)
+    def estimate_error(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        band: Band,
+        last: Increment,
+        before: Increment,
+        x: Increment,
+        # Out:
+        chart: Chart,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0:
+            return
+        if k == model.first_flagellum[c]:
+            chart.commit[c] = 1  # the guards look at this pose
+        worst = real(0.0)
+        if imp.history[c] == 2:
+            # Third divided difference of the increments: what a quadratic path leaves over.
+            w = imp.ratio[c]
+            ratio = imp.last_step[c] / imp.step_before[c]
+            scale = real(w * (w + wp.float64(1.0)) / (wp.float64(1.0) + wp.float64(1.0) / ratio))
+            e = first + 1
+            while e < model.first_node[k + 1]:
+                d = x.node[e] - scale * (last.node[e] - real(ratio) * before.node[e])
+                worst = wp.max(worst, wp.length(vec3(d[0], d[1], d[2])))
+                e += 1
+        imp.error[k] = worst / real(12.0)
+
+    @wp.kernel(module=module)
+    def decide(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        band: Band,
+        contacts_in: Contacts,
+        response_in: Response,
+        # Out:
+        chart: Chart,
+        control: Control,
+        imp: Implicit,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        one = wp.float64(1.0)
+        dt = control.step[c]
+        error = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            error = wp.max(error, wp.float64(imp.error[k]))
+            k += 1
+        sound = band.singular[c] == 0 and response_in.failed[c] == 0 and contacts_in.overflow[c] == 0
+        sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
+        factor = growth
+        allowed = imp.tolerance[c] * dt
+        good = sound
+        if imp.tolerance[c] > wp.float64(0.0) and error > wp.float64(0.0):
+            factor = wp.min(growth, wp.float64(0.9) * wp.sqrt(allowed / error))
+            good = sound and error < wp.float64(1.5) * allowed
+        if good or (sound and dt <= smallest):
+            imp.accepted[c] = 1
+            # A step cut short to end on a target says nothing against the longer one wanted before.
+            imp.wanted_step[c] = wp.min(growth * dt, wp.max(factor * dt, wp.min(factor, one) * imp.wanted_step[c]))
+            imp.step_before[c] = imp.last_step[c]
+            imp.last_step[c] = dt
+            imp.history[c] = wp.min(imp.history[c] + 1, 2)
+            control.steps[c] += 1
+            t = control.time[c] + dt
+            if control.target[c] - t < wp.float64(1.0e-6) * dt:
+                t = control.target[c]
+            control.time[c] = t
+            return
+        imp.accepted[c] = 0
+        chart.commit[c] = 0
+        imp.rejected[c] += 1
+        if sound:
+            imp.wanted_step[c] = dt * wp.max(factor, wp.float64(0.2))
+        else:
+            imp.wanted_step[c] = wp.float64(0.25) * dt
+            if dt <= smallest:
+                if control.fault[c] == no_fault:
+                    control.fault[c] = unsolved
+            else:
+                control.fault[c] = no_fault
+
+    @wp.kernel(module=module)
+    def commit_elements(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        next_last: Increment,
+        next_before: Increment,
+        # Out:
+        chart: Chart,
+        last: Increment,
+        before: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or imp.accepted[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        director = state.director[e]
+        if e == model.first_node[k]:
+            # The motor's turn in this step, seen from the body.
+            old = wp.quat_rotate_inv(chart.base_body_orientation[c], wp.vec3d(chart.base_director[e]))
+            new = wp.quat_rotate_inv(state.body_orientation[c], wp.vec3d(director))
+            axis = wp.vec3d(model.motor_axis[k])
+            chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
+        chart.base_position[e] = state.position[e]
+        chart.base_tangent[e] = state.tangent[e]
+        chart.base_director[e] = director
+        last.node[e] = next_last.node[e]
+        before.node[e] = next_before.node[e]
+
+    @wp.kernel(module=module)
+    def commit_bodies(
+        # State:
+        state: State,
+        next_last: Increment,
+        next_before: Increment,
+        # Out:
+        imp: Implicit,
+        chart: Chart,
+        last: Increment,
+        before: Increment,
+        control: Control,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        if imp.accepted[c] != 0:
+            b = next_last.body[c]
+            chart.body_angle[c] += wp.float64(wp.dot(vec3(b[3], b[4], b[5]), state.body_axis[c]))
+            chart.base_body_position[c] = state.body_position[c]
+            chart.base_body_orientation[c] = state.body_orientation[c]
+            last.body[c] = b
+            before.body[c] = next_before.body[c]
+        if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
+            state.active[c] = 0
+            wp.atomic_sub(control.unfinished, 0, 1)
+
+    return SimpleNamespace(
+        begin=begin,
+        right_hand_side=right_hand_side,
+        add_increments=add_increments,
+        estimate_error=estimate_error,
+        decide=decide,
+        commit_elements=commit_elements,
+        commit_bodies=commit_bodies,
+    )

@@ -1,0 +1,560 @@
+"""How a step answers to forces at the contacts: columns of the implicit system, and the exact contact law among them.
+
+Column c is the increment Y_c = P(g M B_c) that a unit force at contact c causes: B_c acts on the nodes of both sides
+(on the body where a node is r_0), M is the full mobility with its pair sum, P the factorised system. Eight columns
+travel together as one group, which is what fills a vector register. With W = B^T Y the gaps obey
+
+    gap = r + B^T (e_0 - e) + W F(gap)
+
+r and B taken at the pose reached by e, and F the steric force law: solved by Newton, in which only closed contacts
+need a factorisation.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels import banded, chain, contacts, mobility, steric
+from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
+
+GROUP = 8
+NEWTON_ITERATIONS = 60
+HALVINGS = 8
+NEWTON_TOLERANCE = {"float64": 1.0e-9, "float32": 1.0e-5}  # of a gap, in units of sigma
+
+
+@functools.cache
+def types(p: Precision) -> SimpleNamespace:
+    """Block types of a group of columns, and the struct `Response`."""
+    real = p.real
+    mat4g = wp.types.matrix((4, GROUP), real)
+    mat6g = wp.types.matrix((6, GROUP), real)
+
+    @wp.struct
+    class Response:
+        first_column: wp.array(dtype=wp.int32)  # [C + 1], of a cell's groups in `columns`
+        columns: wp.array(dtype=mat4g)  # [sum of groups * elements per cell]
+        body_columns: wp.array(dtype=mat6g)  # [groups]
+        first_entry: wp.array(dtype=wp.int32)  # [C], of a cell's matrices
+        compliance: wp.array(dtype=real)  # W [um/pN]
+        factor: wp.array(dtype=real)  # of the closed contacts
+        closed: wp.array(dtype=wp.int32)  # [capacity], their indices
+        free_gap: wp.array(dtype=real)  # [capacity], gap without contact forces
+        solved_gap: wp.array(dtype=real)  # [capacity]
+        residual: wp.array(dtype=real)  # [capacity]
+        change: wp.array(dtype=real)  # [capacity]
+        force: wp.array(dtype=real)  # [capacity] [pN]
+        gain: wp.array(dtype=wp.float64)  # [C], g
+        failed: wp.array(dtype=wp.int32)  # [C], 1: the contact law was not solved
+
+    return SimpleNamespace(mat4g=mat4g, mat6g=mat6g, Response=Response)
+
+
+@functools.cache
+def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    t, b = types(p), banded.types(p)
+    mat4g, mat6g, Response = t.mat4g, t.mat6g, t.Response
+    vec6, Band = b.vec6, b.Band
+    vecg = wp.types.vector(GROUP, real)
+    Model, State = structs(p).Model, structs(p).State
+    Contacts, Increment = contacts.struct(p), chain.types(p).Increment
+    rotne_prager, body_mobility = mobility.pair_flow(p), banded.functions(p).body_mobility
+    steric_force, steric_stiffness = steric.functions(p).steric_force, steric.functions(p).steric_stiffness
+    within, between = pairs in ("within", "all"), pairs in ("between", "all")
+    module = p.module("response", pairs)
+    group = wp.constant(GROUP)
+    iterations, halvings = wp.constant(NEWTON_ITERATIONS), wp.constant(HALVINGS)
+    newton_tolerance = wp.constant(real(NEWTON_TOLERANCE[p.name]))
+
+    @wp.func(module=module)
+    def extended(f: vec3):
+        return vec4(f[0], f[1], f[2], real(0.0))
+
+    @wp.func(module=module)
+    def column_of(model: Model, response: Response, c: wp.int32, g: wp.int32, e: wp.int32):
+        """Where element e of group g of a cell lies in `columns`."""
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        return response.first_column[c] + g * (end - begin) + e - begin
+
+    @wp.func(module=module)
+    def on_body(f: vec3, y: vec3):
+        """Force f at a point y of the body as force and torque."""
+        torque = wp.cross(y, f)
+        return vec6(f[0], f[1], f[2], torque[0], torque[1], torque[2])
+
+    @wp.func(module=module)
+    def body_lever(model: Model, state: State, i: wp.int32, contacts_in: Contacts):
+        """What a unit force at contact i puts on the body: through anchors, or as the body's reaction."""
+        n = contacts_in.normal[i]
+        e = contacts_in.segment[i]
+        j = contacts_in.other[i]
+        if j < 0:
+            return on_body(-n, state.position[e])
+        lever = vec6(real(0.0))
+        if e - 1 == model.first_node[model.flagellum_of[e]]:
+            lever += on_body((real(1.0) - contacts_in.at[i]) * n, state.position[e - 1])
+        if j - 1 == model.first_node[model.flagellum_of[j]]:
+            lever -= on_body((real(1.0) - contacts_in.at_other[i]) * n, state.position[j - 1])
+        return lever
+
+    @wp.func(module=module)
+    def flow(model: Model, state: State, c: wp.int32, e: wp.int32, source: wp.int32, force: vec3):
+        """Pair-sum velocity of node e from a force on node `source`."""
+        k = model.flagellum_of[e]
+        own = model.flagellum_of[source]
+        if source == model.first_node[own] or source == e:
+            return vec3(real(0.0))
+        if wp.static(not within) and own == k:
+            return vec3(real(0.0))
+        if wp.static(not between) and own != k:
+            return vec3(real(0.0))
+        d = state.position[e] - state.position[source]
+        return model.pair_mobility[c] * rotne_prager(d, force, model.pair_radius[c])
+
+    @wp.kernel(module=module)
+    def right_hand_sides(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        # Out:
+        response: Response,
+    ):
+        e, g = wp.tid()
+        c = model.cell_of[e]
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or g * group >= count:
+            return
+        gain = real(response.gain[c])
+        k = model.flagellum_of[e]
+        block = mat4g(real(0.0))
+        if e > model.first_node[k]:
+            tangent = state.tangent[e]
+            if e + 1 < model.first_node[k + 1]:
+                tangent = wp.normalize(tangent + state.tangent[e + 1])
+            q = int(0)
+            while q < group:
+                if g * group + q < count:
+                    i = contacts_in.first[c] + g * group + q
+                    n = contacts_in.normal[i]
+                    s = contacts_in.at[i]
+                    seg = contacts_in.segment[i]
+                    oth = contacts_in.other[i]
+                    own = vec3(real(0.0))
+                    if seg == e:
+                        own = s * n
+                    elif oth == e:
+                        own = -contacts_in.at_other[i] * n
+                    if oth >= 0:
+                        if seg - 1 == e:
+                            own += (real(1.0) - s) * n
+                        elif oth - 1 == e:
+                            own -= (real(1.0) - contacts_in.at_other[i]) * n
+                    if wp.static(pairs != "none"):
+                        v = flow(model, state, c, e, seg, s * n)
+                        if oth >= 0:
+                            r = contacts_in.at_other[i]
+                            v += flow(model, state, c, e, seg - 1, (real(1.0) - s) * n)
+                            v -= flow(model, state, c, e, oth, r * n)
+                            v -= flow(model, state, c, e, oth - 1, (real(1.0) - r) * n)
+                        along = wp.dot(tangent, v) * tangent
+                        own += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+                    block[0, q] = gain * own[0]
+                    block[1, q] = gain * own[1]
+                    block[2, q] = gain * own[2]
+                q += 1
+        response.columns[column_of(model, response, c, g, e)] = block
+
+    @wp.kernel(module=module)
+    def solve_flagella(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        band: Band,
+        # Out:
+        response: Response,
+    ):
+        k, g = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0 or g * group >= contacts_in.count[c]:
+            return
+        start = column_of(model, response, c, g, first)
+        size = model.first_node[k + 1] - first
+        y1 = mat4g(real(0.0))
+        y2 = mat4g(real(0.0))
+        i = int(0)
+        while i < size:
+            y = response.columns[start + i]
+            if i > 0:
+                y -= band.lower1[first + i] * y1
+            if i > 1:
+                y -= band.lower2[first + i] * y2
+            response.columns[start + i] = y
+            y2 = y1
+            y1 = y
+            i += 1
+        y1 = mat4g(real(0.0))
+        y2 = mat4g(real(0.0))
+        i = size - 1
+        while i >= 0:
+            y = band.diagonal[first + i] * response.columns[start + i]
+            if i + 1 < size:
+                y -= wp.transpose(band.lower1[first + i + 1]) * y1
+            if i + 2 < size:
+                y -= wp.transpose(band.lower2[first + i + 2]) * y2
+            response.columns[start + i] = y
+            y2 = y1
+            y1 = y
+            i -= 1
+
+    @wp.kernel(module=module)
+    def solve_bodies(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        band: Band,
+        # Out:
+        response: Response,
+    ):
+        c, g = wp.tid()
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or g * group >= count:
+            return
+        back = mat6g(real(0.0))
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            first = model.first_node[k]
+            for j in range(3):
+                column = column_of(model, response, c, g, first + j)
+                back += wp.transpose(band.from_body[3 * k + j]) * response.columns[column]
+            k += 1
+        weight = real(band.weight[c])
+        rates = mat6g(real(0.0))
+        q = int(0)
+        while q < group:
+            if g * group + q < count:
+                i = contacts_in.first[c] + g * group + q
+                f = real(response.gain[c]) * body_lever(model, state, i, contacts_in)
+                force = vec3(f[0], f[1], f[2]) - weight * vec3(back[0, q], back[1, q], back[2, q])
+                torque = vec3(f[3], f[4], f[5]) - weight * vec3(back[3, q], back[4, q], back[5, q])
+                v = body_mobility(model, state, c, force, torque)
+                j = int(0)
+                while j < 6:
+                    rates[j, q] = v[j]
+                    j += 1
+            q += 1
+        response.body_columns[contacts_in.first[c] / group + g] = real(band.step[c]) * (band.body_inverse[c] * rates)
+
+    @wp.kernel(module=module)
+    def follow_bodies(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        band: Band,
+        # Out:
+        response: Response,
+    ):
+        e, g = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or g * group >= contacts_in.count[c]:
+            return
+        column = column_of(model, response, c, g, e)
+        body = response.body_columns[contacts_in.first[c] / group + g]
+        response.columns[column] = response.columns[column] - band.body_columns[e] * body
+
+    @wp.func(module=module)
+    def group_forces(response: Response, contacts_in: Contacts, c: wp.int32, g: wp.int32):
+        """Solved contact forces of one group, zero beyond the list's end."""
+        forces = vecg(real(0.0))
+        q = int(0)
+        while q < group:
+            if g * group + q < contacts_in.count[c]:
+                forces[q] = response.force[contacts_in.first[c] + g * group + q]
+            q += 1
+        return forces
+
+    @wp.kernel(module=module)
+    def project(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        start: Increment,
+        now: Increment,
+        # Out:
+        response: Response,
+    ):
+        c, index = wp.tid()
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or index >= count:
+            return
+        i = contacts_in.first[c] + index
+        n = extended(contacts_in.normal[i])
+        e = contacts_in.segment[i]
+        j = contacts_in.other[i]
+        first = contacts_in.at[i] * n
+        before = (real(1.0) - contacts_in.at[i]) * n
+        other = -contacts_in.at_other[i] * n
+        other_before = (contacts_in.at_other[i] - real(1.0)) * n
+        lever = body_lever(model, state, i, contacts_in)
+        has_before = j >= 0 and e - 1 != model.first_node[model.flagellum_of[e]]
+        has_other_before = False
+        if j >= 0:
+            has_other_before = j - 1 != model.first_node[model.flagellum_of[j]]
+        free = contacts_in.gap[i] + wp.dot(first, start.node[e] - now.node[e])
+        free += wp.dot(lever, start.body[c] - now.body[c])
+        if has_before:
+            free += wp.dot(before, start.node[e - 1] - now.node[e - 1])
+        if j >= 0:
+            free += wp.dot(other, start.node[j] - now.node[j])
+        if has_other_before:
+            free += wp.dot(other_before, start.node[j - 1] - now.node[j - 1])
+        response.free_gap[i] = free
+        row = response.first_entry[c] + index * count
+        g = int(0)
+        while g * group < count:
+            w = first * response.columns[column_of(model, response, c, g, e)]
+            w += lever * response.body_columns[contacts_in.first[c] / group + g]
+            if has_before:
+                w += before * response.columns[column_of(model, response, c, g, e - 1)]
+            if j >= 0:
+                w += other * response.columns[column_of(model, response, c, g, j)]
+            if has_other_before:
+                w += other_before * response.columns[column_of(model, response, c, g, j - 1)]
+            q = int(0)
+            while q < group:
+                if g * group + q < count:
+                    response.compliance[row + g * group + q] = w[q]
+                q += 1
+            g += 1
+
+    @wp.func(module=module)
+    def evaluate(response: Response, strength: real, diameter: real, first: wp.int32, entry: wp.int32, count: wp.int32):
+        """Forces and residuals at the solved gaps; the largest residual."""
+        i = int(0)
+        while i < count:
+            response.force[first + i] = steric_force(response.solved_gap[first + i], strength, diameter)
+            i += 1
+        worst = real(0.0)
+        i = int(0)
+        while i < count:
+            r = response.solved_gap[first + i] - response.free_gap[first + i]
+            j = int(0)
+            while j < count:
+                f = response.force[first + j]
+                if f != real(0.0):
+                    r -= response.compliance[entry + i * count + j] * f
+                j += 1
+            response.residual[first + i] = r
+            worst = wp.max(worst, wp.abs(r))
+            i += 1
+        return worst
+
+    @wp.kernel(module=module)
+    def solve_gaps(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        # Out:
+        response: Response,
+    ):
+        c = wp.tid()
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or count == 0:
+            return
+        first = contacts_in.first[c]
+        entry = response.first_entry[c]
+        strength = model.steric_strength[c]
+        diameter = model.steric_diameter[c]
+        tolerance = newton_tolerance * diameter
+        i = int(0)
+        while i < count:
+            response.solved_gap[first + i] = contacts_in.gap[first + i]
+            i += 1
+        worst = evaluate(response, strength, diameter, first, entry, count)
+        iteration = int(0)
+        while worst > tolerance and iteration < iterations:
+            # Closed contacts: (1/k + W) lambda = -residual, k the contact stiffness; symmetric, so L D L^T.
+            closed = int(0)
+            i = int(0)
+            while i < count:
+                if steric_stiffness(response.solved_gap[first + i], strength, diameter) > real(0.0):
+                    response.closed[first + closed] = i
+                    closed += 1
+                i += 1
+            i = int(0)
+            while i < closed:
+                a = response.closed[first + i]
+                j = int(0)
+                while j <= i:
+                    value = response.compliance[entry + a * count + response.closed[first + j]]
+                    if i == j:
+                        gap = response.solved_gap[first + a]
+                        value += real(1.0) / steric_stiffness(gap, strength, diameter)
+                    m = int(0)
+                    while m < j:
+                        value -= (
+                            response.factor[entry + i * count + m]
+                            * response.factor[entry + j * count + m]
+                            * response.factor[entry + m * count + m]
+                        )
+                        m += 1
+                    if j < i:
+                        value = value / response.factor[entry + j * count + j]
+                    response.factor[entry + i * count + j] = value
+                    j += 1
+                i += 1
+            i = int(0)
+            while i < closed:
+                value = -response.residual[first + response.closed[first + i]]
+                j = int(0)
+                while j < i:
+                    value -= response.factor[entry + i * count + j] * response.change[first + j]
+                    j += 1
+                response.change[first + i] = value
+                i += 1
+            i = closed - 1
+            while i >= 0:
+                value = response.change[first + i] / response.factor[entry + i * count + i]
+                j = i + 1
+                while j < closed:
+                    value -= response.factor[entry + j * count + i] * response.change[first + j]
+                    j += 1
+                response.change[first + i] = value
+                i -= 1
+            # Change of every gap: -residual - W lambda; kept in place of the residual.
+            i = int(0)
+            while i < count:
+                value = -response.residual[first + i]
+                j = int(0)
+                while j < closed:
+                    value -= (
+                        response.compliance[entry + i * count + response.closed[first + j]] * response.change[first + j]
+                    )
+                    j += 1
+                response.residual[first + i] = value
+                i += 1
+            i = int(0)
+            while i < count:
+                response.change[first + i] = response.residual[first + i]
+                response.solved_gap[first + i] += response.change[first + i]
+                i += 1
+            before = worst
+            worst = evaluate(response, strength, diameter, first, entry, count)
+            halving = int(0)
+            scale = real(1.0)
+            while not (worst < before) and halving < halvings and worst > tolerance:
+                scale = real(0.5) * scale
+                i = int(0)
+                while i < count:
+                    response.solved_gap[first + i] -= scale * response.change[first + i]
+                    i += 1
+                worst = evaluate(response, strength, diameter, first, entry, count)
+                halving += 1
+            iteration += 1
+        if not (worst <= tolerance):
+            response.failed[c] = 1
+
+    @wp.kernel(module=module)
+    def apply_nodes(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        response: Response,
+        start: Increment,
+        # Out:
+        x: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        value = start.node[e]
+        g = int(0)
+        while g * group < contacts_in.count[c]:
+            forces = group_forces(response, contacts_in, c, g)
+            value += response.columns[column_of(model, response, c, g, e)] * forces
+            g += 1
+        x.node[e] = value
+
+    @wp.kernel(module=module)
+    def apply_bodies(
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        response: Response,
+        start: Increment,
+        # Out:
+        x: Increment,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        value = start.body[c]
+        g = int(0)
+        while g * group < contacts_in.count[c]:
+            forces = group_forces(response, contacts_in, c, g)
+            value += response.body_columns[contacts_in.first[c] / group + g] * forces
+            g += 1
+        x.body[c] = value
+
+    return SimpleNamespace(
+        right_hand_sides=right_hand_sides,
+        solve_flagella=solve_flagella,
+        solve_bodies=solve_bodies,
+        follow_bodies=follow_bodies,
+        project=project,
+        solve_gaps=solve_gaps,
+        apply_nodes=apply_nodes,
+        apply_bodies=apply_bodies,
+    )
+
+
+def respond(
+    model: DeviceModel,
+    state: DeviceState,
+    contacts_in: Any,
+    band: Any,
+    response: Any,
+    groups: int,
+    start: Any,
+    now: Any,
+    out: Any,
+) -> None:
+    """The increment with contact forces, from the one without.
+
+    Args:
+        groups: launch size, groups of columns per cell at most.
+        start: increment e_0 without contact forces.
+        now: increment e at which the contacts were found.
+        out: e_0 + Y F; may be `now`.
+    """
+    kernels, device = _kernels(model.precision, model.switches.pairs), model.device
+    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+    inputs = [model.data, state.data, contacts_in]
+    wp.launch(kernels.right_hand_sides, (elements, groups), inputs=[*inputs, response], device=device)
+    wp.launch(kernels.solve_flagella, (flagella, groups), inputs=[*inputs, band, response], device=device)
+    wp.launch(kernels.solve_bodies, (cells, groups), inputs=[*inputs, band, response], device=device)
+    wp.launch(kernels.follow_bodies, (elements, groups), inputs=[*inputs, band, response], device=device)
+    wp.launch(kernels.project, (cells, groups * GROUP), inputs=[*inputs, start, now, response], device=device)
+    wp.launch(kernels.solve_gaps, cells, inputs=[*inputs, response], device=device)
+    wp.launch(kernels.apply_nodes, elements, inputs=[*inputs, response, start, out], device=device)
+    inputs = [state.data, contacts_in, response, start, out]
+    wp.launch(kernels.apply_bodies, cells, inputs=inputs, device=device)

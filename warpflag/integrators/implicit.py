@@ -1,0 +1,196 @@
+"""Linearly implicit stepping of every cell of a system: BDF2 with exact contacts, see `warpflag_kernels.implicit`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpflag_kernels import banded, chain, contacts, control, guard, hessian, implicit, response
+
+from warpflag.integrators.stepper import System
+from warpflag.scene import Scene
+from warpflag.stages import launch_right_hand_side
+
+__all__ = ["ImplicitStepper"]
+
+LONGEST_STEP = 4.0e-5
+"""Longest step that the accuracy control takes [s]."""
+DEFAULT_ACCURACY = 5.0e-3
+"""Node error per simulated time that `numerics.accuracy` asks for when it is absent [um/ms]."""
+FIRST_STEP = 1.0e-9
+"""First step after a start, when nothing is known of the motion yet [s]."""
+
+
+class ImplicitStepper:
+    """Linearly implicit BDF2; `numerics.time_step` fixes the step, else `numerics.accuracy` controls it.
+
+    Args:
+        system: what to advance.
+        scenes: one per cell.
+    """
+
+    def __init__(self, system: System, scenes: Sequence[Scene]) -> None:
+        self._system = system
+        model = system.model
+        self._free = dataclasses.replace(
+            model, switches=dataclasses.replace(model.switches, steric=False, body_contact=False)
+        )
+        self._touches = model.switches.steric or model.switches.body_contact
+        p, device = model.precision, model.device
+        cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(max(count, 1), dtype=dtype, device=device)
+
+        # Poses that share the arrays of the state and of the start of the step.
+        t, s, base = chain.types(p), system.state.data, system.chart
+        self._now, self._base, self._trial = t.Pose(), t.Pose(), t.Pose()
+        for name in ("position", "tangent", "director", "length"):
+            setattr(self._now, name, getattr(s, name))
+            setattr(self._trial, name, wp.zeros_like(getattr(s, name)))
+        for name in ("body_position", "body_orientation", "body_axis"):
+            setattr(self._now, name, getattr(s, name))
+            setattr(self._trial, name, wp.zeros_like(getattr(s, name)))
+        self._base.position, self._base.tangent = base.base_position, base.base_tangent
+        self._base.director = base.base_director
+        self._base.body_position, self._base.body_orientation = base.base_body_position, base.base_body_orientation
+
+        def increment() -> Any:
+            x = t.Increment()
+            x.node, x.body = zeros(elements, p.vec4), zeros(cells, t.vec6)
+            return x
+
+        self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
+        self._carried, self._carried_before, self._total = (increment() for _ in range(3))
+        self._free_step, self._step, self._zero = (increment() for _ in range(3))
+
+        k = hessian.struct(p)()
+        k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
+        k.e_first, k.e_second, k.f_first, k.f_second, k.spins = (zeros(elements, p.vec3) for _ in range(5))
+        self._stiffness = k
+
+        bt = banded.types(p)
+        b = bt.Band()
+        b.step, b.weight = zeros(cells, wp.float64), zeros(cells, wp.float64)
+        b.diagonal, b.lower1, b.lower2 = (zeros(elements, bt.mat44) for _ in range(3))
+        b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
+        b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(elements, bt.mat46)
+        b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
+        self._band = b
+
+        self._contacts, self._response, self._groups = self._contact_arrays()
+
+        i = implicit.struct(p)()
+        i.tolerance, i.over_implicit, i.wanted_step = (zeros(cells, wp.float64) for _ in range(3))
+        i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
+        i.one = wp.ones(cells, dtype=wp.float64, device=device)
+        i.history, i.accepted, i.rejected, i.evaluations = (zeros(cells, wp.int32) for _ in range(4))
+        i.error = zeros(flagella, p.real)
+        self.data = i
+        fixed = [scene.numerics.time_step for scene in scenes]
+        accuracy = [scene.numerics.accuracy or DEFAULT_ACCURACY for scene in scenes]
+        i.tolerance.assign([0.0 if f else a * 1e3 for f, a in zip(fixed, accuracy, strict=True)])
+        # The flows that stay outside the matrix grow with the number of flagella.
+        i.over_implicit.assign([1.3 if len(s.resolved_flagella()) < 3 else 2.0 for s in scenes])
+        system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
+        system.guard.interval.fill_(1)
+        self.restart()
+
+    def launch_pass(self) -> None:
+        s, i, band = self._system, self.data, self._band
+        model, state, device = s.model, s.state, s.model.device
+        k = implicit.kernels(model.precision)
+        touching = self._contacts, self._response
+        wp.launch(k.begin, model.cell_count, inputs=[state.data, s.control, i, band, *touching], device=device)
+        carry = (self._last, self._before, self._carried, self._carried_before)
+        chain.retract(model, state, self._base, i.ratio, self._last, self._now, carry)
+        launch_right_hand_side(self._free, state)
+        hessian.joint_stiffness(model, state, self._stiffness)
+        banded.factorise(model, state, self._stiffness, band)
+        inputs = [model.data, state.data, i, band, self._response, self._carried, self._free_step, self._zero]
+        wp.launch(k.right_hand_side, model.element_count, inputs=inputs, device=device)
+        banded.solve(model, state, band, self._free_step)
+        x = self._free_step
+        if self._touches:
+            x = self._step
+            # Contacts of the extrapolated pose, then of the pose that these contacts lead to.
+            contacts.find(model, state, self._now, self._contacts)
+            respond = (model, state, self._contacts, band, self._response, self._groups, self._free_step)
+            response.respond(*respond, self._zero, x)
+            carry = (self._carried, self._carried_before, self._next_last, self._next_before)
+            chain.retract(model, state, self._now, i.one, x, self._trial, carry)
+            contacts.find(model, state, self._trial, self._contacts)
+            response.respond(*respond, x, x)
+        inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
+        wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
+        inputs = [model.data, state.data, i, self._carried, x, self._total]
+        wp.launch(k.add_increments, model.element_count, inputs=inputs, device=device)
+        carry = (self._total, self._carried, self._next_last, self._next_before)
+        chain.retract(model, state, self._now, i.one, x, self._now, carry)
+        guard.check(model, state, s.chart, s.guard, s.control)
+        inputs = [model.data, state.data, band, *touching, s.chart, s.control, i]
+        wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
+        moved = [self._next_last, self._next_before]
+        inputs = [model.data, state.data, i, *moved, s.chart, self._last, self._before]
+        wp.launch(k.commit_elements, model.element_count, inputs=inputs, device=device)
+        guard.remember(model, state, s.chart, s.guard, s.control)
+        inputs = [state.data, *moved, i, s.chart, self._last, self._before, s.control]
+        wp.launch(k.commit_bodies, model.cell_count, inputs=inputs, device=device)
+        control.count_pass(s.control, device)
+
+    def restart(self) -> None:
+        self.data.history.zero_()
+        longest = self._system.control.longest_step.numpy()
+        controlled = self.data.tolerance.numpy() > 0.0
+        self.data.wanted_step.assign(np.where(controlled, FIRST_STEP, longest / 64))
+
+    def memory(self) -> dict[str, np.ndarray]:
+        names = ("wanted_step", "last_step", "step_before", "history", "rejected", "evaluations")
+        kept = {name: getattr(self.data, name).numpy() for name in names}
+        for name, x in (("last", self._last), ("before", self._before)):
+            kept |= {f"{name}_node": x.node.numpy(), f"{name}_body": x.body.numpy()}
+        return kept
+
+    def recall(self, memory: dict[str, np.ndarray]) -> None:
+        for name, x in (("last", self._last), ("before", self._before)):
+            x.node.assign(memory.pop(f"{name}_node"))
+            x.body.assign(memory.pop(f"{name}_body"))
+        for name, values in memory.items():
+            getattr(self.data, name).assign(values)
+
+    def _contact_arrays(self) -> tuple[Any, Any, int]:
+        """Lists and matrices of contacts: one and a half per segment of a cell, a measured bound with room."""
+        model = self._system.model
+        p, device = model.precision, model.device
+        first_node = model.data.first_node.numpy()
+        nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
+        groups = np.ceil(1.5 * nodes / response.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
+        capacity = groups * response.GROUP
+        total = int(capacity.sum())
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        def offsets(counts: np.ndarray) -> wp.array:
+            return wp.array(np.concatenate([[0], np.cumsum(counts)]), dtype=wp.int32, device=device)
+
+        c = contacts.struct(p)()
+        c.first = offsets(capacity)
+        c.count, c.overflow = zeros(len(nodes), wp.int32), zeros(len(nodes), wp.int32)
+        c.own = zeros(model.element_count, wp.int32)
+        c.segment, c.other = zeros(total, wp.int32), zeros(total, wp.int32)
+        c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
+        c.normal = zeros(total, p.vec3)
+
+        t = response.types(p)
+        r = t.Response()
+        r.first_column, r.first_entry = offsets(groups * nodes), offsets(capacity**2)
+        r.columns, r.body_columns = zeros(int((groups * nodes).sum()), t.mat4g), zeros(int(groups.sum()), t.mat6g)
+        r.compliance, r.factor = (zeros(int((capacity**2).sum()), p.real) for _ in range(2))
+        r.closed = zeros(total, wp.int32)
+        r.free_gap, r.solved_gap, r.residual, r.change, r.force = (zeros(total, p.real) for _ in range(5))
+        r.gain, r.failed = zeros(len(nodes), wp.float64), zeros(len(nodes), wp.int32)
+        return c, r, int(groups.max())
