@@ -23,6 +23,10 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.types import Precision, structs
 
 LARGEST_GROWTH = 1.9  # of the step from one to the next; BDF2 is stable below 1 + sqrt(2)
+REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
+SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
+MEMORY = 5.0e-4  # of that mean [s]
+ROUND_OFF = {"float64": 1.0e-14, "float32": 5.0e-6}  # of an error estimate [um]
 SMALLEST_STEP = 1.0e-13  # [s]; a step that fails here ends the cell's run
 
 
@@ -42,8 +46,11 @@ def struct(p: Precision) -> Any:
         ratio: wp.array(dtype=wp.float64)  # w
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
         error: wp.array(dtype=real)  # [K], largest node error estimate [um]
+        error_sum: wp.array(dtype=wp.float64)  # fading sum of dt log(error/dt^3)
+        error_time: wp.array(dtype=wp.float64)  # fading sum of dt [s]
         accepted: wp.array(dtype=wp.int32)
         rejected: wp.array(dtype=wp.int32)  # steps taken again so far
+        retries: wp.array(dtype=wp.int32)  # of the present step, for its error estimate
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
     return Implicit
@@ -60,6 +67,10 @@ def kernels(p: Precision) -> SimpleNamespace:
     module = p.module("implicit")
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
+    refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
+    round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
+    tiny = wp.constant(wp.float64(1.0e-12))
+    memory = wp.constant(wp.float64(MEMORY))
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
 
     @wp.kernel(module=module)
@@ -219,13 +230,27 @@ def kernels(p: Precision) -> SimpleNamespace:
         sound = band.singular[c] == 0 and response_in.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         factor = growth
-        allowed = imp.tolerance[c] * dt
         good = sound
-        if imp.tolerance[c] > wp.float64(0.0) and error > wp.float64(0.0):
-            factor = wp.min(growth, wp.float64(0.9) * wp.sqrt(allowed / error))
-            good = sound and error < wp.float64(1.5) * allowed
-        if good or (sound and dt <= smallest):
+        tolerance = imp.tolerance[c]
+        if tolerance > wp.float64(0.0):
+            # Errors go as dt^3. A contact that opens or closes makes single estimates jump, though what adds up over
+            # time is the level between the jumps: hence the mean of the logarithm.
+            rate = error / dt
+            # A jump of the velocity keeps its rate however short the step: three times are enough.
+            good = sound and (rate < refused * tolerance or imp.retries[c] == 3)
+            if good and imp.history[c] == 2:
+                fade = wp.exp(-dt / memory)
+                level = wp.log(wp.max(error - round_off, tiny * dt) / (dt * dt * dt))
+                imp.error_sum[c] = fade * imp.error_sum[c] + level * dt
+                imp.error_time[c] = fade * imp.error_time[c] + dt
+                level = wp.exp(imp.error_sum[c] / imp.error_time[c])
+                factor = wp.min(growth, wp.sqrt(safety * tolerance / level) / dt)
+                # A steady step is more accurate than one that follows every fluctuation.
+                if factor > wp.float64(0.8) and factor < wp.float64(1.25):
+                    factor = one
+        if good:
             imp.accepted[c] = 1
+            imp.retries[c] = 0
             # A step cut short to end on a target says nothing against the longer one wanted before.
             imp.wanted_step[c] = wp.min(growth * dt, wp.max(factor * dt, wp.min(factor, one) * imp.wanted_step[c]))
             imp.step_before[c] = imp.last_step[c]
@@ -240,8 +265,9 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.accepted[c] = 0
         chart.commit[c] = 0
         imp.rejected[c] += 1
+        imp.wanted_step[c] = wp.float64(0.5) * dt
         if sound:
-            imp.wanted_step[c] = dt * wp.max(factor, wp.float64(0.2))
+            imp.retries[c] += 1
         else:
             imp.wanted_step[c] = wp.float64(0.25) * dt
             if dt <= smallest:

@@ -16,11 +16,11 @@ from warpflag.stages import launch_right_hand_side
 
 __all__ = ["ImplicitStepper"]
 
-LONGEST_STEP = 4.0e-5
+LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
 DEFAULT_ACCURACY = 5.0e-3
 """Node error per simulated time that `numerics.accuracy` asks for when it is absent [um/ms]."""
-FIRST_STEP = 1.0e-9
+FIRST_STEP = 1.0e-8
 """First step after a start, when nothing is known of the motion yet [s]."""
 
 
@@ -86,8 +86,9 @@ class ImplicitStepper:
         i = implicit.struct(p)()
         i.tolerance, i.over_implicit, i.wanted_step = (zeros(cells, wp.float64) for _ in range(3))
         i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
+        i.error_sum, i.error_time = zeros(cells, wp.float64), zeros(cells, wp.float64)
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
-        i.history, i.accepted, i.rejected, i.evaluations = (zeros(cells, wp.int32) for _ in range(4))
+        i.history, i.accepted, i.rejected, i.retries, i.evaluations = (zeros(cells, wp.int32) for _ in range(5))
         i.error = zeros(flagella, p.real)
         self.data = i
         fixed = [scene.numerics.time_step for scene in scenes]
@@ -143,12 +144,23 @@ class ImplicitStepper:
 
     def restart(self) -> None:
         self.data.history.zero_()
+        self.data.error_sum.zero_()
+        self.data.error_time.zero_()
         longest = self._system.control.longest_step.numpy()
         controlled = self.data.tolerance.numpy() > 0.0
         self.data.wanted_step.assign(np.where(controlled, FIRST_STEP, longest / 64))
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("wanted_step", "last_step", "step_before", "history", "rejected", "evaluations")
+        names = (
+            "wanted_step",
+            "last_step",
+            "step_before",
+            "error_sum",
+            "error_time",
+            "history",
+            "rejected",
+            "evaluations",
+        )
         kept = {name: getattr(self.data, name).numpy() for name in names}
         for name, x in (("last", self._last), ("before", self._before)):
             kept |= {f"{name}_node": x.node.numpy(), f"{name}_body": x.body.numpy()}
