@@ -51,7 +51,7 @@ def types(p: Precision) -> SimpleNamespace:
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions of the band: the body's mobility."""
-    real, vec3, vec6 = p.real, p.vec3, types(p).vec6
+    _real, vec3, vec6 = p.real, p.vec3, types(p).vec6
     Model, State = structs(p).Model, structs(p).State
 
     @wp.func(module=p.module("banded_functions"))

@@ -171,8 +171,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[first]
         if state.active[c] == 0 or chart.rest[c] == 0:
             return
-        # Least squares: node velocities relative to the anchor, and spins weighted by h^2 (keeps a straight rod regular).
-        h = model.segment_length[k]
+        # Least squares over node velocities relative to the anchor. Spins count little: a straight rod needs them to be
+        # regular, but while they relax they are no rotation of the flagellum and would spoil the fit.
+        weight = real(0.01) * model.segment_length[k] * model.segment_length[k]
         matrix = mat33(real(0.0))
         moment = vec3(real(0.0))
         identity = wp.identity(3, dtype=real)
@@ -181,8 +182,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             d = state.position[e] - state.position[first]
             t = state.tangent[e]
             spin = model.spin_mobility[k] * state.spin_torque[e]
-            matrix += wp.dot(d, d) * identity - wp.outer(d, d) + (h * h) * wp.outer(t, t)
-            moment += wp.cross(d, state.velocity[e] - state.velocity[first]) + (h * h * spin) * t
+            matrix += wp.dot(d, d) * identity - wp.outer(d, d) + weight * wp.outer(t, t)
+            moment += wp.cross(d, state.velocity[e] - state.velocity[first]) + (weight * spin) * t
             e += 1
         chart.flagellum_spin[k] = wp.inverse(matrix) * moment
         chart.flagellum_turn[k] = identity

@@ -41,7 +41,7 @@ def struct(p: Precision) -> Any:
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+    real, _vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
     closest_parameters = steric.functions(p).closest_parameters
     reach_factor = real(steric.CUTOFF + MARGIN)

@@ -35,7 +35,10 @@ def _kernels() -> SimpleNamespace:
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module)
-    def count_pass(control: Control):
+    def count_pass(
+        # Out:
+        control: Control,
+    ):
         control.budget[0] = control.budget[0] - 1
         control.proceed[0] = wp.where(control.unfinished[0] > 0 and control.budget[0] > 0, 1, 0)
 

@@ -74,11 +74,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
-        if chart.rest[c] == 0:
-            return False
+        if chart.commit[c] == 0:
+            return chart.rest[c] != 0  # a start
         left = control.target[c] - (control.time[c] + control.step[c])
         ends = left < tolerance * control.step[c]
-        return chart.commit[c] == 0 or ends or (control.steps[c] + 1) % guard.interval[c] == 0
+        return ends or (control.steps[c] + 1) % guard.interval[c] == 0
 
     @wp.kernel(module=module)
     def check_elements(
@@ -243,6 +243,6 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
     """Keeps the checked pose: the next check looks for crossings since then."""
-    if model.flagellum_count > model.cell_count:
+    if model.switches.steric:
         inputs = [model.data, state.data, control, chart, guard]
         wp.launch(_kernels(model.precision).remember, model.element_count, inputs=inputs, device=model.device)

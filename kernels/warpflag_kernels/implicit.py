@@ -63,7 +63,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     Chart, Implicit = chart_stage.struct(p), struct(p)
     Band, Contacts = banded.types(p).Band, contacts.struct(p)
     Response = response.types(p).Response
-    Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
+    _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
     module = p.module("implicit")
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
@@ -120,6 +120,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         last: Increment,
         # Out:
         x: Increment,
+        drive: Increment,
         zero: Increment,
     ):
         e = wp.tid()
@@ -135,16 +136,20 @@ def kernels(p: Precision) -> SimpleNamespace:
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = gain * (state.velocity[e] - slope * vec3(carried[0], carried[1], carried[2]))
+            drive.node[e] = vec4(v[0], v[1], v[2], spin)
             t = state.tangent[e]
             if e + 1 < model.first_node[k + 1]:
                 t = wp.normalize(t + state.tangent[e + 1])
             along = wp.dot(t, v) * t
             v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
-        elif k == model.first_flagellum[c]:
+        else:
+            drive.node[e] = vec4(v[0], v[1], v[2], spin)
+        if e == model.first_node[model.first_flagellum[c]]:
             u = state.body_velocity[c]
             w = state.body_spin[c]
-            rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
-            x.body[c] = gain * (rate - slope * last.body[c])
+            rate = gain * (vec6(u[0], u[1], u[2], w[0], w[1], w[2]) - slope * last.body[c])
+            x.body[c] = rate
+            drive.body[c] = rate
             zero.body[c] = vec6(real(0.0))
         x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 

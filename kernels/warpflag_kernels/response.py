@@ -46,6 +46,8 @@ def types(p: Precision) -> SimpleNamespace:
         residual: wp.array(dtype=real)  # [capacity]
         change: wp.array(dtype=real)  # [capacity]
         force: wp.array(dtype=real)  # [capacity] [pN]
+        total_force: wp.array(dtype=real)  # [capacity], corrections included [pN]
+        closed_count: wp.array(dtype=wp.int32)  # [C], rows of `factor`
         gain: wp.array(dtype=wp.float64)  # [C], g
         failed: wp.array(dtype=wp.int32)  # [C], 1: the contact law was not solved
 
@@ -285,6 +287,24 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             q += 1
         return forces
 
+    @wp.func(module=module)
+    def gap_change(model: Model, state: State, contacts_in: Contacts, i: wp.int32, x: Increment):
+        """B^T x of contact i: how an increment changes its gap."""
+        n = extended(contacts_in.normal[i])
+        e = contacts_in.segment[i]
+        j = contacts_in.other[i]
+        s = contacts_in.at[i]
+        change = s * wp.dot(n, x.node[e])
+        change += wp.dot(body_lever(model, state, i, contacts_in), x.body[model.cell_of[e]])
+        if j >= 0:
+            r = contacts_in.at_other[i]
+            change -= r * wp.dot(n, x.node[j])
+            if e - 1 != model.first_node[model.flagellum_of[e]]:
+                change += (real(1.0) - s) * wp.dot(n, x.node[e - 1])
+            if j - 1 != model.first_node[model.flagellum_of[j]]:
+                change -= (real(1.0) - r) * wp.dot(n, x.node[j - 1])
+        return change
+
     @wp.kernel(module=module)
     def project(
         # Model:
@@ -302,38 +322,29 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         if state.active[c] == 0 or index >= count:
             return
         i = contacts_in.first[c] + index
+        free = gap_change(model, state, contacts_in, i, start) - gap_change(model, state, contacts_in, i, now)
+        response.free_gap[i] = contacts_in.gap[i] + free
         n = extended(contacts_in.normal[i])
+        s = contacts_in.at[i]
+        r = contacts_in.at_other[i]
         e = contacts_in.segment[i]
         j = contacts_in.other[i]
-        first = contacts_in.at[i] * n
-        before = (real(1.0) - contacts_in.at[i]) * n
-        other = -contacts_in.at_other[i] * n
-        other_before = (contacts_in.at_other[i] - real(1.0)) * n
         lever = body_lever(model, state, i, contacts_in)
         has_before = j >= 0 and e - 1 != model.first_node[model.flagellum_of[e]]
         has_other_before = False
         if j >= 0:
             has_other_before = j - 1 != model.first_node[model.flagellum_of[j]]
-        free = contacts_in.gap[i] + wp.dot(first, start.node[e] - now.node[e])
-        free += wp.dot(lever, start.body[c] - now.body[c])
-        if has_before:
-            free += wp.dot(before, start.node[e - 1] - now.node[e - 1])
-        if j >= 0:
-            free += wp.dot(other, start.node[j] - now.node[j])
-        if has_other_before:
-            free += wp.dot(other_before, start.node[j - 1] - now.node[j - 1])
-        response.free_gap[i] = free
         row = response.first_entry[c] + index * count
         g = int(0)
         while g * group < count:
-            w = first * response.columns[column_of(model, response, c, g, e)]
+            w = (s * n) * response.columns[column_of(model, response, c, g, e)]
             w += lever * response.body_columns[contacts_in.first[c] / group + g]
             if has_before:
-                w += before * response.columns[column_of(model, response, c, g, e - 1)]
+                w += ((real(1.0) - s) * n) * response.columns[column_of(model, response, c, g, e - 1)]
             if j >= 0:
-                w += other * response.columns[column_of(model, response, c, g, j)]
+                w -= (r * n) * response.columns[column_of(model, response, c, g, j)]
             if has_other_before:
-                w += other_before * response.columns[column_of(model, response, c, g, j - 1)]
+                w -= ((real(1.0) - r) * n) * response.columns[column_of(model, response, c, g, j - 1)]
             q = int(0)
             while q < group:
                 if g * group + q < count:
@@ -363,6 +374,98 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             i += 1
         return worst
 
+    @wp.func(module=module)
+    def factorise_closed(
+        response: Response, strength: real, diameter: real, first: wp.int32, entry: wp.int32, count: wp.int32
+    ):
+        """L D L^T of (1/k + W) over the closed contacts, k the contact stiffness; how many they are."""
+        closed = int(0)
+        i = int(0)
+        while i < count:
+            if steric_stiffness(response.solved_gap[first + i], strength, diameter) > real(0.0):
+                response.closed[first + closed] = i
+                closed += 1
+            i += 1
+        i = int(0)
+        while i < closed:
+            a = response.closed[first + i]
+            j = int(0)
+            while j <= i:
+                value = response.compliance[entry + a * count + response.closed[first + j]]
+                if i == j:
+                    value += real(1.0) / steric_stiffness(response.solved_gap[first + a], strength, diameter)
+                m = int(0)
+                while m < j:
+                    value -= (
+                        response.factor[entry + i * count + m]
+                        * response.factor[entry + j * count + m]
+                        * response.factor[entry + m * count + m]
+                    )
+                    m += 1
+                if j < i:
+                    value = value / response.factor[entry + j * count + j]
+                response.factor[entry + i * count + j] = value
+                j += 1
+            i += 1
+        return closed
+
+    @wp.func(module=module)
+    def solve_closed(response: Response, first: wp.int32, entry: wp.int32, count: wp.int32, closed: wp.int32):
+        """Solves with that factorisation; right-hand side and solution in `change`."""
+        i = int(0)
+        while i < closed:
+            value = response.change[first + i]
+            j = int(0)
+            while j < i:
+                value -= response.factor[entry + i * count + j] * response.change[first + j]
+                j += 1
+            response.change[first + i] = value
+            i += 1
+        i = closed - 1
+        while i >= 0:
+            value = response.change[first + i] / response.factor[entry + i * count + i]
+            j = i + 1
+            while j < closed:
+                value -= response.factor[entry + j * count + i] * response.change[first + j]
+                j += 1
+            response.change[first + i] = value
+            i -= 1
+
+    @wp.kernel(module=module)
+    def yield_closed(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        x: Increment,
+        # Out:
+        response: Response,
+    ):
+        c = wp.tid()
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or count == 0:
+            return
+        first = contacts_in.first[c]
+        entry = response.first_entry[c]
+        closed = response.closed_count[c]
+        i = int(0)
+        while i < closed:
+            a = first + response.closed[first + i]
+            response.change[first + i] = -gap_change(model, state, contacts_in, a, x)
+            i += 1
+        solve_closed(response, first, entry, count, closed)
+        i = int(0)
+        while i < count:
+            response.force[first + i] = real(0.0)
+            i += 1
+        i = int(0)
+        while i < closed:
+            a = first + response.closed[first + i]
+            response.force[a] = response.change[first + i]
+            response.total_force[a] += response.change[first + i]
+            i += 1
+
     @wp.kernel(module=module)
     def solve_gaps(
         # Model:
@@ -389,54 +492,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         worst = evaluate(response, strength, diameter, first, entry, count)
         iteration = int(0)
         while worst > tolerance and iteration < iterations:
-            # Closed contacts: (1/k + W) lambda = -residual, k the contact stiffness; symmetric, so L D L^T.
-            closed = int(0)
-            i = int(0)
-            while i < count:
-                if steric_stiffness(response.solved_gap[first + i], strength, diameter) > real(0.0):
-                    response.closed[first + closed] = i
-                    closed += 1
-                i += 1
+            closed = factorise_closed(response, strength, diameter, first, entry, count)
             i = int(0)
             while i < closed:
-                a = response.closed[first + i]
-                j = int(0)
-                while j <= i:
-                    value = response.compliance[entry + a * count + response.closed[first + j]]
-                    if i == j:
-                        gap = response.solved_gap[first + a]
-                        value += real(1.0) / steric_stiffness(gap, strength, diameter)
-                    m = int(0)
-                    while m < j:
-                        value -= (
-                            response.factor[entry + i * count + m]
-                            * response.factor[entry + j * count + m]
-                            * response.factor[entry + m * count + m]
-                        )
-                        m += 1
-                    if j < i:
-                        value = value / response.factor[entry + j * count + j]
-                    response.factor[entry + i * count + j] = value
-                    j += 1
+                response.change[first + i] = -response.residual[first + response.closed[first + i]]
                 i += 1
-            i = int(0)
-            while i < closed:
-                value = -response.residual[first + response.closed[first + i]]
-                j = int(0)
-                while j < i:
-                    value -= response.factor[entry + i * count + j] * response.change[first + j]
-                    j += 1
-                response.change[first + i] = value
-                i += 1
-            i = closed - 1
-            while i >= 0:
-                value = response.change[first + i] / response.factor[entry + i * count + i]
-                j = i + 1
-                while j < closed:
-                    value -= response.factor[entry + j * count + i] * response.change[first + j]
-                    j += 1
-                response.change[first + i] = value
-                i -= 1
+            solve_closed(response, first, entry, count, closed)
             # Change of every gap: -residual - W lambda; kept in place of the residual.
             i = int(0)
             while i < count:
@@ -469,6 +530,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             iteration += 1
         if not (worst <= tolerance):
             response.failed[c] = 1
+        closed = factorise_closed(response, strength, diameter, first, entry, count)
+        response.closed_count[c] = closed
+        i = int(0)
+        while i < count:
+            response.total_force[first + i] = response.force[first + i]
+            i += 1
 
     @wp.kernel(module=module)
     def apply_nodes(
@@ -522,6 +589,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         follow_bodies=follow_bodies,
         project=project,
         solve_gaps=solve_gaps,
+        yield_closed=yield_closed,
         apply_nodes=apply_nodes,
         apply_bodies=apply_bodies,
     )
@@ -558,3 +626,20 @@ def respond(
     wp.launch(kernels.apply_nodes, elements, inputs=[*inputs, response, start, out], device=device)
     inputs = [state.data, contacts_in, response, start, out]
     wp.launch(kernels.apply_bodies, cells, inputs=inputs, device=device)
+
+
+def yield_contacts(
+    model: DeviceModel, state: DeviceState, contacts_in: Any, response: Any, change: Any, out: Any
+) -> None:
+    """A small change of the increment, after the closed contacts have answered to it linearly.
+
+    Args:
+        change: increment z without the contacts' answer.
+        out: z + Y dF; not `change` itself.
+    """
+    kernels, device = _kernels(model.precision, model.switches.pairs), model.device
+    inputs = [model.data, state.data, contacts_in, change, response]
+    wp.launch(kernels.yield_closed, model.cell_count, inputs=inputs, device=device)
+    inputs = [model.data, state.data, contacts_in, response, change, out]
+    wp.launch(kernels.apply_nodes, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.apply_bodies, model.cell_count, inputs=inputs[1:], device=device)

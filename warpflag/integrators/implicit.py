@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import banded, chain, contacts, control, guard, hessian, implicit, response
+from warpflag_kernels import banded, chain, contacts, control, correction, guard, hessian, implicit, response
 
 from warpflag.integrators.stepper import System
 from warpflag.scene import Scene
@@ -20,6 +20,8 @@ LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
 DEFAULT_ACCURACY = 5.0e-3
 """Node error per simulated time that `numerics.accuracy` asks for when it is absent [um/ms]."""
+SWEEPS = 1
+"""Defect corrections per step for the flows that stay outside the matrix."""
 FIRST_STEP = 1.0e-8
 """First step after a start, when nothing is known of the motion yet [s]."""
 
@@ -66,6 +68,8 @@ class ImplicitStepper:
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
         self._free_step, self._step, self._zero = (increment() for _ in range(3))
+        self._drive, self._defect, self._scratch = (increment() for _ in range(3))
+        self._sweeps = SWEEPS
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -111,7 +115,8 @@ class ImplicitStepper:
         launch_right_hand_side(self._free, state)
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
-        inputs = [model.data, state.data, i, band, self._response, self._carried, self._free_step, self._zero]
+        inputs = [model.data, state.data, i, band, self._response, self._carried]
+        inputs += [self._free_step, self._drive, self._zero]
         wp.launch(k.right_hand_side, model.element_count, inputs=inputs, device=device)
         banded.solve(model, state, band, self._free_step)
         x = self._free_step
@@ -125,6 +130,10 @@ class ImplicitStepper:
             chain.retract(model, state, self._now, i.one, x, self._trial, carry)
             contacts.find(model, state, self._trial, self._contacts)
             response.respond(*respond, x, x)
+        for _ in range(self._sweeps):
+            correction.correct(
+                model, state, self._stiffness, band, *touching, self._drive, x, self._defect, self._scratch
+            )
         inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
         wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
         inputs = [model.data, state.data, i, self._carried, x, self._total]
@@ -161,9 +170,9 @@ class ImplicitStepper:
             "rejected",
             "evaluations",
         )
-        kept = {name: getattr(self.data, name).numpy() for name in names}
+        kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         for name, x in (("last", self._last), ("before", self._before)):
-            kept |= {f"{name}_node": x.node.numpy(), f"{name}_body": x.body.numpy()}
+            kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
@@ -203,6 +212,8 @@ class ImplicitStepper:
         r.columns, r.body_columns = zeros(int((groups * nodes).sum()), t.mat4g), zeros(int(groups.sum()), t.mat6g)
         r.compliance, r.factor = (zeros(int((capacity**2).sum()), p.real) for _ in range(2))
         r.closed = zeros(total, wp.int32)
-        r.free_gap, r.solved_gap, r.residual, r.change, r.force = (zeros(total, p.real) for _ in range(5))
+        r.free_gap, r.solved_gap, r.residual, r.change = (zeros(total, p.real) for _ in range(4))
+        r.force, r.total_force = zeros(total, p.real), zeros(total, p.real)
+        r.closed_count = zeros(len(nodes), wp.int32)
         r.gain, r.failed = zeros(len(nodes), wp.float64), zeros(len(nodes), wp.int32)
         return c, r, int(groups.max())

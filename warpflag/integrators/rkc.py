@@ -86,8 +86,9 @@ class RkcStepper:
         self.data.probes_left.fill_(rkc.FIRST_PROBES)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("probe", "probe_norm", "probes_left", "spectral_radius", "evaluations")
-        return {name: getattr(self.data, name).numpy() for name in names}
+        names = ("stage", "start_rate", "body_start_rate", "evaluations")
+        names += ("probe", "probe_norm", "probes_left", "spectral_radius")
+        return {name: getattr(self.data, name).numpy().copy() for name in names}
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         for name, values in memory.items():
