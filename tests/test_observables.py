@@ -212,7 +212,7 @@ def test_bundled_nodes_agree_with_a_plain_search_in_any_block_size(monkeypatch):
             expected.append(nearest <= 0.44)
     assert 0 < sum(expected) < len(expected)
     for block in (1, 40, 1 << 20):
-        monkeypatch.setattr(observables, "_PAIRS_PER_BLOCK", block)
+        monkeypatch.setattr(observables.bundle, "_PAIRS_PER_BLOCK", block)
         np.testing.assert_array_equal(observables.bundled_nodes(positions, first_node), expected)
 
 

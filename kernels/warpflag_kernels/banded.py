@@ -4,7 +4,7 @@
 
 D is the local mobility, H the elastic Hessian. Unknowns of element i are (node increment, spin increment), so a joint
 couples elements i, i + 1, i + 2: K is symmetric and block pentadiagonal with 4 x 4 blocks, and is factorised as
-L D L^T along the flagellum without pivoting. The rows of r_0, which moves with the body, are unit rows; its coupling
+C C^T along the flagellum (block Cholesky; an inverse by cofactors in its place loses all digits on fine meshes). The rows of r_0, which moves with the body, are unit rows; its coupling
 goes through the six unknowns of the body (u, w) and a Schur complement:
 
     S = 1 + dt s M_b (H_bb - H_bf W),    W = K^-1 s H_fb
@@ -33,7 +33,7 @@ def types(p: Precision) -> SimpleNamespace:
         # Per cell [C], set by the stepper.
         step: wp.array(dtype=wp.float64)  # dt [s]
         weight: wp.array(dtype=wp.float64)  # s
-        # Blocks of row i [E]: to i, i - 1, i - 2; the factorisation replaces them by D^-1, L_(i,i-1), L_(i,i-2).
+        # Blocks of row i [E]: to i, i - 1, i - 2; replaced by C_ii^-1, C_(i,i-1), C_(i,i-2).
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
@@ -213,6 +213,39 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         band.from_body[3 * k + 2] = to2
         band.body_block[k] = shared
 
+    @wp.func(module=module)
+    def inverse_cholesky(a: mat44):
+        """Inverse of the lower Cholesky factor; all zero where a pivot is not positive."""
+        zero, one = real(0.0), real(1.0)
+        p0 = a[0, 0]
+        i0 = one / wp.sqrt(p0)
+        c10 = a[1, 0] * i0
+        c20 = a[2, 0] * i0
+        c30 = a[3, 0] * i0
+        p1 = a[1, 1] - c10 * c10
+        i1 = one / wp.sqrt(p1)
+        c21 = (a[2, 1] - c20 * c10) * i1
+        c31 = (a[3, 1] - c30 * c10) * i1
+        p2 = a[2, 2] - c20 * c20 - c21 * c21
+        i2 = one / wp.sqrt(p2)
+        c32 = (a[3, 2] - c30 * c20 - c31 * c21) * i2
+        p3 = a[3, 3] - c30 * c30 - c31 * c31 - c32 * c32
+        i3 = one / wp.sqrt(p3)
+        if not (p0 > zero and p1 > zero and p2 > zero and p3 > zero):  # NaN fails this, too
+            return mat44(zero)
+        x10 = -c10 * i0 * i1
+        x21 = -c21 * i1 * i2
+        x32 = -c32 * i2 * i3
+        x20 = -(c20 * i0 + c21 * x10) * i2
+        x31 = -(c31 * i1 + c32 * x21) * i3
+        x30 = -(c30 * i0 + c31 * x10 + c32 * x20) * i3
+        return mat44(
+            i0, zero, zero, zero,
+            x10, i1, zero, zero,
+            x20, x21, i2, zero,
+            x30, x31, x32, i3,
+        )  # fmt: skip
+
     @wp.kernel(module=module)
     def factorise(
         # Model:
@@ -228,37 +261,29 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         c = model.cell_of[first]
         if state.active[c] == 0:
             return
-        l1_before = mat44(real(0.0))  # L_(i-1,i-2)
+        c1_before = mat44(real(0.0))  # C_(i-1,i-2)
         inverse1 = mat44(real(0.0))
         inverse2 = mat44(real(0.0))
         i = first
         while i < end:
             d = band.diagonal[i]
-            l1 = mat44(real(0.0))
+            c1 = mat44(real(0.0))
             if i > first:
-                a1 = band.lower1[i]
+                c1 = band.lower1[i]
                 if i > first + 1:
-                    a2 = band.lower2[i]
-                    l2 = a2 * inverse2
-                    a1 -= a2 * wp.transpose(l1_before)
-                    d -= l2 * wp.transpose(a2)
-                    band.lower2[i] = l2
-                l1 = a1 * inverse1
-                d -= l1 * wp.transpose(a1)
-                band.lower1[i] = l1
-            inverse = wp.inverse(d)
-            # NaN fails these too.
-            if not (
-                inverse[0, 0] > real(0.0)
-                and inverse[1, 1] > real(0.0)
-                and inverse[2, 2] > real(0.0)
-                and inverse[3, 3] > real(0.0)
-            ):
-                band.singular[c] = 1
-            band.diagonal[i] = inverse
+                    c2 = band.lower2[i] * wp.transpose(inverse2)
+                    c1 -= c2 * wp.transpose(c1_before)
+                    d -= c2 * wp.transpose(c2)
+                    band.lower2[i] = c2
+                c1 = c1 * wp.transpose(inverse1)
+                d -= c1 * wp.transpose(c1)
+                band.lower1[i] = c1
             inverse2 = inverse1
-            inverse1 = inverse
-            l1_before = l1
+            inverse1 = inverse_cholesky(d)
+            if inverse1[0, 0] == real(0.0):
+                band.singular[c] = 1
+            band.diagonal[i] = inverse1
+            c1_before = c1
             i += 1
 
     @wp.kernel(module=module)
@@ -288,6 +313,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
                 y -= band.lower1[i] * y1
             if i > first + 1:
                 y -= band.lower2[i] * y2
+            y = band.diagonal[i] * y
             band.body_columns[i] = y
             y2 = y1
             y1 = y
@@ -296,11 +322,12 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         y2 = mat46(real(0.0))
         i = end - 1
         while i >= first:
-            y = band.diagonal[i] * band.body_columns[i]
+            y = band.body_columns[i]
             if i + 1 < end:
                 y -= wp.transpose(band.lower1[i + 1]) * y1
             if i + 2 < end:
                 y -= wp.transpose(band.lower2[i + 2]) * y2
+            y = wp.transpose(band.diagonal[i]) * y
             band.body_columns[i] = y
             y2 = y1
             y1 = y
@@ -413,6 +440,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
                 y -= band.lower1[i] * y1
             if i > first + 1:
                 y -= band.lower2[i] * y2
+            y = band.diagonal[i] * y
             x.node[i] = y
             y2 = y1
             y1 = y
@@ -421,11 +449,12 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         y2 = vec4(real(0.0))
         i = end - 1
         while i >= first:
-            y = band.diagonal[i] * x.node[i]
+            y = x.node[i]
             if i + 1 < end:
                 y -= wp.transpose(band.lower1[i + 1]) * y1
             if i + 2 < end:
                 y -= wp.transpose(band.lower2[i + 2]) * y2
+            y = wp.transpose(band.diagonal[i]) * y
             x.node[i] = y
             y2 = y1
             y1 = y

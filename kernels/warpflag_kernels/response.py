@@ -199,6 +199,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                 y -= band.lower1[first + i] * y1
             if i > 1:
                 y -= band.lower2[first + i] * y2
+            y = band.diagonal[first + i] * y
             response.columns[start + i] = y
             y2 = y1
             y1 = y
@@ -207,11 +208,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         y2 = mat4g(real(0.0))
         i = size - 1
         while i >= 0:
-            y = band.diagonal[first + i] * response.columns[start + i]
+            y = response.columns[start + i]
             if i + 1 < size:
                 y -= wp.transpose(band.lower1[first + i + 1]) * y1
             if i + 2 < size:
                 y -= wp.transpose(band.lower2[first + i + 2]) * y2
+            y = wp.transpose(band.diagonal[first + i]) * y
             response.columns[start + i] = y
             y2 = y1
             y1 = y

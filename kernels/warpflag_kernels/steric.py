@@ -68,10 +68,12 @@ def functions(p: Precision) -> SimpleNamespace:
         f = wp.dot(d2, r)
         c = wp.dot(d1, r)
         b = wp.dot(d1, d2)
-        denominator = a * e - b * b
+        # Through the cross product: a e - b^2 would lose the digits of nearly parallel segments.
+        n = wp.cross(d1, d2)
+        nn = wp.dot(n, n)
         s = real(0.5)  # parallel: any point will do, the middle keeps the lever balanced
-        if denominator > real(1.0e-7) * a * e:
-            s = wp.clamp((b * f - c * e) / denominator, zero, one)
+        if nn > real(1.0e-10) * a * e:
+            s = wp.clamp(wp.dot(wp.cross(d2, r), n) / nn, zero, one)
         t = (b * s + f) / e
         if t < zero:
             t = zero

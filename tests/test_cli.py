@@ -1,0 +1,221 @@
+"""The command line: what it prints, where it writes, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from warpflag import cli
+from warpflag.record import Record
+from warpflag.scene import load
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+SMALL = """
+name = "small"
+duration = 4e-5
+frames = 4
+flagella.length = 2.0
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch) -> str:
+    """A scene of a few steps, in the directory where the command is given."""
+    monkeypatch.chdir(tmp_path)
+    Path("small.toml").write_text(SMALL)
+    return "small.toml"
+
+
+def command(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own."""
+    return subprocess.run([sys.executable, "-m", "warpflag", *arguments], capture_output=True, text=True, **options)
+
+
+def refused(capsys, *arguments: str) -> str:
+    """The one line that a command says about bad input."""
+    try:
+        status = cli.main(arguments)
+    except SystemExit as exit:  # argparse
+        status = exit.code
+    said = capsys.readouterr()
+    assert status == 2
+    assert said.out == ""
+    assert said.err.endswith("\n") and said.err.count("\n") == 1, said.err
+    return said.err
+
+
+def test_help_imports_nothing_heavy_and_is_quick():
+    heavy = {"warp", "numpy", "h5py", "pxr"}
+    code = (
+        f"import sys; from warpflag import cli; cli._parser().format_help(); assert not {heavy!r} & sys.modules.keys()"
+    )
+    subprocess.run([sys.executable, "-c", code.replace(repr(heavy), repr(set(heavy)))], check=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    shown = command("--help")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert shown.returncode == 0 and "devices" in shown.stdout
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 0.5
+
+
+MALFORMED = [
+    "duration = ",
+    "name = 3",
+    "name = 'a/b'",
+    "duration = 0",
+    "duration = -1e-3",
+    "duration = 15",
+    "duration = nan",
+    "frames = 0",
+    "frames = 1.5",
+    "durations = 0.015",
+    "flagella = 2",
+    "[flagella]\ncount = 0",
+    "[flagella]\nlength = 6e-6",
+    "[flagella]\nlength = 6000.0",
+    "[flagella]\nsegment_length = 5.0",
+    "[flagella]\nopening_angle = 270.0",
+    "[flagella]\nphase_difference = 0.01",
+    "[flagella]\ncount = 1\nphase_difference = 0.5",
+    "[flagella]\nanchor_offset = 3.0",
+    "[flagella]\nintrinsic_curvature = [0.0, 1.3]",
+    "[flagella]\nbending_rigidity = -3.5",
+    "[flagella]\nbending_rigidity = 3.5e-24",
+    "[motor]\ntorque = '3.4'",
+    "[motor]\ntorque = inf",
+    "[motor]\ntorqe = 3.4",
+    "[moter]\ntorque = 3.4",
+    "[fluid]\nviscosity = 0.0",
+    "[hydrodynamics]\nmode = 'full'",
+    "[hydrodynamics]\nmode = 'none'\npair_radius = 0.03",
+    "[steric]\nenabled = 1",
+    "[steric]\nstrength = 8e-13",
+    "[body]\nwidth = 3.0",
+    "[body]\nanchored = 'yes'",
+    "[numerics]\nstepper = 'rk4'",
+    "[numerics]\ntime_step = -1e-6",
+    "duration = 1e-4\n[numerics]\ntime_step = 1e-3",
+    "[numerics]\nprecision = 'double'",
+    "[start]\nrecord = 'nowhere'",
+    "[start]\nframe = 3",
+    "[[flagellum]]\nazimuth = 10.0\n[[flagellum]]\nazimuth = 10.0",
+    "[[flagellum]]\nlenght = 3.0",
+]
+
+
+@pytest.mark.parametrize("toml", MALFORMED)
+def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.toml").write_text(toml)
+    line = refused(capsys, "run", "bad.toml", "-o", "made")
+    assert line.startswith("warpflag: bad.toml: ")
+    assert os.listdir() == ["bad.toml"]
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["run"], ["SCENE.toml", "--resume"]),
+        (["run", "missing.toml"], ["missing.toml", "no such file"]),
+        (["run", "small.toml", "--set", "motor.torqe=2"], ["--set", "motor.torqe", "motor.torque"]),
+        (["run", "small.toml", "--set", "motor.torque"], ["motor.torque", "key=value"]),
+        (["run", "small.toml", "--device", "cuda:7"], ["cuda:7", "cpu"]),
+        (["run", "small.toml", "--precision", "half"], ["half", "float32"]),
+        (["run", "small.toml", "-o", "small.toml"], ["small.toml", "exists"]),
+        (["run", "small.toml", "--resume", "."], ["either"]),
+        (["run", "--resume", "nowhere"], ["nowhere", "scene.toml"]),
+        (["run", "--resume", "nowhere", "-o", "elsewhere"], ["--resume", "-o"]),
+        (["check", "missing.toml"], ["missing.toml", "no such file"]),
+        (["check", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
+        (["export", "nowhere", "--to", "usd"], ["nowhere", "no such record"]),
+        (["export", "nowhere", "--to", "gif"], ["gif", "usd"]),
+        (["export", "nowhere", "--to", "usd", "-o", "movie.mp4"], ["movie.mp4", ".usdc"]),
+        (["swim"], ["swim", "run"]),
+    ],
+)
+def test_a_wrong_command_is_one_line(arguments, words, scene, capsys):
+    line = refused(capsys, *arguments)
+    assert line.startswith("warpflag") and all(word in line for word in words), line
+    assert os.listdir() == [scene]
+
+
+def test_bad_input_of_a_real_process(scene):
+    ended = command("run", scene, "--set", "motor.torque=much")
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.count("\n") == 1 and "motor.torque" in ended.stderr
+
+
+def test_a_run_says_where_it_wrote_and_nothing_of_warp(scene):
+    ended = command("run", scene)
+    assert ended.returncode == 0
+    assert ended.stdout.count("\n") == 1 and ended.stdout.endswith(f"{Path('runs', 'small')}\n")
+    assert all(line.endswith("ms per ms") or "compiling" in line for line in ended.stderr.splitlines()), ended.stderr
+    quiet = command("run", scene, "--quiet")
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+
+
+def test_directories_are_numbered_and_never_overwritten(scene, capsys):
+    for expected in ("small", "small-2", "small-3"):
+        assert cli.main(["run", scene]) == 0
+        assert capsys.readouterr().out.endswith(f"{Path('runs', expected)}\n")
+    assert cli.main(["run", scene, "-o", "named", "--quiet"]) == 0
+    before = Path("named/run.h5").read_bytes()
+    line = refused(capsys, "run", scene, "-o", "named")
+    assert "--resume named" in line and "-o" in line
+    assert Path("named/run.h5").read_bytes() == before
+
+
+def test_values_are_set_in_any_order(scene):
+    assert cli.main(["run", "--quiet", "--set", "frames=2", "duration=2e-5", scene]) == 0
+    assert (
+        cli.main(["run", scene, "--set", "frames=1", "--precision", "float32", "--set", "duration=2e-5", "--quiet"])
+        == 0
+    )
+    first, second = load("runs/small/scene.toml"), load("runs/small-2/scene.toml")
+    assert (first.frames, first.duration, first.numerics.precision) == (2, 2e-5, "float64")
+    assert (second.frames, second.duration, second.numerics.precision) == (1, 2e-5, "float32")
+
+
+def test_check_prints_a_scene_and_what_it_requires(scene, capsys):
+    assert cli.main(["check", scene, "--set", "frames=3"]) == 0
+    everything = capsys.readouterr().out
+    Path("resolved.toml").write_text(everything)
+    assert load("resolved.toml") == load(scene, ["frames=3"])
+    assert "steric, body contact" in everything and "pair sum (all)" in everything
+    assert "2 flagella, 20 segments, 22 nodes" in everything and "cpu" in everything
+    assert cli.main(["check", scene, "--set", "steric.enabled=false", "hydrodynamics.mode=none"]) == 0
+    bare = capsys.readouterr().out
+    assert "steric," not in bare and "pair sum" not in bare
+    assert os.listdir() != [] and not Path("runs").exists()
+
+
+def test_devices_lists_the_cpu(capsys):
+    assert cli.main(["devices"]) == 0
+    assert any(line.split()[0] == "cpu" for line in capsys.readouterr().out.splitlines())
+
+
+def test_export_writes_the_movie_again(scene, capsys):
+    assert cli.main(["run", scene, "-o", "made", "--quiet"]) == 0
+    movie = Path("made/movie.usdc")
+    first = movie.read_bytes()
+    movie.unlink()
+    assert cli.main(["export", "made", "--to", "usd"]) == 0
+    assert movie.read_bytes() == first
+    assert cli.main(["export", "made", "--to", "usd", "-o", "other.usdc"]) == 0
+    assert capsys.readouterr().out.splitlines() == [str(movie), "other.usdc"]
+    assert Path("other.usdc").read_bytes() == first
+
+
+def test_a_stopped_run_keeps_its_frames(scene, capsys):
+    # Explicit Euler at 200 times its stable step.
+    wrong = ["numerics.stepper=euler", "numerics.time_step=1e-6", "duration=1e-3"]
+    assert cli.main(["run", scene, "-o", "made", "--set", *wrong]) == 3
+    said = capsys.readouterr()
+    line = said.err.splitlines()[-1]
+    assert said.out == "" and "flagellum" in line and "numerics.time_step" in line and "made" in line
+    with Record("made") as record:
+        assert record.frame_count >= 1

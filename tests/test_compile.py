@@ -1,0 +1,72 @@
+"""Every kernel compiles for CUDA (sm_80 and sm_90), in both precisions, on a machine without a GPU."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import pytest
+import warp as wp
+import warpflag_kernels
+
+from tests.helpers import cell
+from warpflag.simulation import Simulation
+
+KERNELS = Path(warpflag_kernels.__file__).parent
+# With the scene that has every term: each term on and off, and every pair sum.
+SWITCHES = {
+    "within": {"hydrodynamics.mode": "within", "steric.enabled": False, "motor.bearing_torque": False},
+    "between": {"hydrodynamics.mode": "between", "body.contact": False},
+    "none": {
+        "hydrodynamics.mode": "none",
+        "steric.enabled": False,
+        "body.contact": False,
+        "motor.bearing_torque": False,
+    },
+}
+STEPPERS = ("rkc", "euler", "implicit")
+# What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
+VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("implicit", "none")]
+
+
+def kernels_in_source() -> set[tuple[str, str]]:
+    """File and name of every function under a kernel decorator."""
+    found = set()
+    for path in KERNELS.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list):
+                found.add((path.name, node.name))
+    return found
+
+
+def launched(monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any]) -> set[Any]:
+    """Kernels that a run of this kind launches, without compiling or running one."""
+    kernels = set()
+    scene = cell({"numerics.stepper": stepper, **switches}, precision)
+    sim = Simulation(scene, device="cpu")
+    with monkeypatch.context() as patch:
+        patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.add(kernel))
+        patch.setattr(wp, "launch_tiled", lambda kernel, *_args, **_options: kernels.add(kernel))
+        sim.stepper.launch_pass()
+        sim.evaluate()
+        sim.cell_state()
+    return kernels
+
+
+def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
+    whole = set().union(*(launched(monkeypatch, precision, stepper, {}) for stepper in STEPPERS))
+    reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
+    used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced}
+    assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
+    # To keep this short, what a variant compiles anew meets one architecture per precision, so both in all.
+    targets = {kernel.module: [80] if precision == "float64" else [90] for kernel in reduced}
+    targets |= {kernel.module: [80, 90] for kernel in whole}
+    for module, architectures in targets.items():
+        assert module.name.startswith("warpflag_kernels.")
+        folder = tmp_path / module.name
+        made = wp.compile_aot_module(module, device=None, arch=architectures, module_dir=folder, use_ptx=False)
+        assert [path.suffix for path in made] == [".cubin"] * len(architectures)
+        for path, arch in zip(made, architectures, strict=True):
+            assert f"sm{arch}" in path.name
+            assert path.stat().st_size > 1000
