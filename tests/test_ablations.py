@@ -41,24 +41,21 @@ def close(a: np.ndarray, b: np.ndarray, precision: str) -> bool:
         ("consistent", True, True),
     ],
 )
-def test_hydrodynamic_modes_couple_the_nodes_they_name(mode, own, other, device, precision):
-    """Stretching the last segment of flagellum 0 changes the forces on its last two nodes: who else feels it?"""
+@pytest.mark.parametrize("flagellum", [0, 1])
+def test_hydrodynamic_modes_couple_the_nodes_they_name(mode, own, other, flagellum, device, precision):
+    """Stretching the last segment of one flagellum changes the forces on its last two nodes: who else feels it?"""
     scene = cell({"hydrodynamics.mode": mode, "flagella.segment_length": 0.1, "steric.enabled": False}, precision)
     start = initial_state(scene)
     nodes = [x.copy() for x in start.positions]
-    nodes[0][-1] += 0.02 * (nodes[0][-1] - nodes[0][-2])
-    before, after = (
-        evaluated(scene, shape, device).velocities
-        for shape in (start, dataclasses.replace(start, positions=tuple(nodes)))
-    )
-    change = np.linalg.norm(after - before, axis=1)
-    first = anchors(scene)
-    assert change[first[1] - 1] > 1.0  # the end itself [um/s]
+    nodes[flagellum][-1] += 0.02 * (nodes[flagellum][-1] - nodes[flagellum][-2])
+    stretched = dataclasses.replace(start, positions=tuple(nodes))
+    before, after = (evaluated(scene, shape, device).velocities for shape in (start, stretched))
+    change = np.split(np.linalg.norm(after - before, axis=1), anchors(scene)[1:])
+    assert change[flagellum][-1] > 1.0  # the end itself [um/s]
     # A mode that leaves a pair out does so to the last bit.
-    assert (change[1 : first[1] - 4] > 0).all() == own
-    assert (change[first[1] + 1 :] > 0).all() == other
-    assert (change[1 : first[1] - 4] > 0).any() == own
-    assert (change[first[1] + 1 :] > 0).any() == other
+    expected = (own, change[flagellum][1:-4]), (other, change[1 - flagellum][1:])
+    for coupled, changes in expected:
+        assert (changes > 0).all() if coupled else (changes == 0).all()
 
 
 def test_pair_radius_is_the_filaments_as_printed_and_larger_otherwise(device):

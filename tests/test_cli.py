@@ -133,7 +133,7 @@ def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypa
         (["check", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
         (["export", "nowhere", "--to", "usd"], ["nowhere", "no such record"]),
         (["export", "nowhere", "--to", "gif"], ["gif", "usd"]),
-        (["export", "nowhere", "--to", "usd", "-o", "movie.mp4"], ["movie.mp4", ".usdc"]),
+        (["export", "nowhere", "--to", "usd", "-o", "movie.mp4"], ["nowhere", "no such record"]),
         (["swim"], ["swim", "run"]),
     ],
 )
@@ -208,6 +208,7 @@ def test_export_writes_the_movie_again(scene, capsys):
     assert cli.main(["export", "made", "--to", "usd", "-o", "other.usdc"]) == 0
     assert capsys.readouterr().out.splitlines() == [str(movie), "other.usdc"]
     assert Path("other.usdc").read_bytes() == first
+    assert ".usdc" in refused(capsys, "export", "made", "--to", "usd", "-o", "movie.mp4")
 
 
 def test_a_stopped_run_keeps_its_frames(scene, capsys):

@@ -147,6 +147,15 @@ def test_euler_steps_too_long_end_in_an_error_or_in_right_numbers(factor, device
         assert factor < 1.6
 
 
+def test_where_an_advance_ends_is_looked_at_whatever_the_interval(device):
+    scene = with_values(cell(), {"numerics.stepper": "euler"})
+    step = 10 * euler_step(scene)
+    sim = Simulation(with_values(scene, {"numerics.time_step": step}), device=device)
+    assert sim.system.guard.interval.numpy()[0] > 15
+    with pytest.raises(NumericalError):
+        sim.advance(15 * step)
+
+
 def test_the_printed_mobility_bursts_at_contact_and_is_stopped(device):
     """Not positive definite at contact: no step is short enough."""
     for step in (1e-5, 1e-6):

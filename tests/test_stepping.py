@@ -9,15 +9,18 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from warpflag_kernels import chart
 
-from tests.helpers import as_start, cell, displaced, free_nodes, shaken, touching_cell
+from tests.helpers import anchors, as_start, cell, displaced, free_nodes, shaken, touching_cell
 from warpflag.geometry import InitialState
 from warpflag.scene import Scene, with_values
 from warpflag.simulation import CellState, Simulation
+from warpflag.stages import launch_right_hand_side
 
 # Relative error of the spectral radius from finite differences: float64, float32.
 RADIUS_TOLERANCE = {"float64": 0.03, "float32": 0.03}
 COEFFICIENT_TOLERANCE = 1e-10
+RATE_TOLERANCE = 1e-6
 STATE = ("positions", "directors", "motor_angle", "body_position", "body_orientation")
 
 
@@ -66,6 +69,44 @@ def test_rkc_is_second_order_against_euler(make, device):
     assert errors["positions"][0] < 1e-3
     if make is touching_cell:
         assert min(state.steric_force for state in (coarse, fine)) > 0.1
+
+
+def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
+    """Far from the start of a step, in a turning chart: the placed state moves with the velocities and spins."""
+    scene = cell()
+    sim = Simulation(scene, device=device, starts=shaken(scene, seed=2, node=1e-3))
+    model, state, c = sim.system.model, sim.system.state, sim.system.chart
+    random, first = np.random.default_rng(3), anchors(scene)
+    nodes = random.uniform(-1, 1, (model.element_count, 4)) * [0.01, 0.01, 0.01, 0.3]
+    nodes[first, :3] = 0.0
+    body = random.uniform(-1, 1, (1, 6)) * [0.1, 0.1, 0.1, 0.5, 0.5, 0.5]
+    c.flagellum_spin.assign(random.uniform(-1, 1, (2, 3)) * 5e4)
+
+    def place(shift: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        c.increment.assign(nodes + shift * rates[0])
+        c.body_increment.assign(body + shift * rates[1])
+        c.elapsed.fill_(1e-5 + shift)
+        state.data.active.fill_(1)
+        chart.place(model, state, c)
+        return tuple(a.numpy().copy() for a in (state.data.position, state.data.director, state.data.body_position))
+
+    rates = np.zeros_like(nodes), np.zeros_like(body)
+    _, directors, _ = place(0.0)
+    launch_right_hand_side(model, state)
+    chart.increment_rates(model, state, c)
+    rates = c.rate.numpy().copy(), c.body_rate.numpy().copy()
+    s = state.data
+    tangents, velocities, spin = s.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
+    spins = model.data.spin_mobility.numpy()[0] * s.spin_torque.numpy()
+    centre_velocity = s.body_velocity.numpy()[0].copy()
+    along = np.diff(velocities, axis=0, prepend=0) / s.length.numpy()[:, None]
+    along[first] = np.cross(spin, tangents[first])  # the tripod's axis turns with the body
+    turning = np.cross(tangents, along) + spins[:, None] * tangents
+    step = 1e-12
+    moved = [(b - a) / (2 * step) for a, b in zip(place(-step), place(step), strict=True)]
+    expected = velocities - centre_velocity, np.cross(turning, directors), centre_velocity
+    for found, exact in zip(moved, expected, strict=True):
+        assert np.abs(found - exact).max() < RATE_TOLERANCE * np.abs(exact).max()
 
 
 def coefficients(sim: Simulation, stages: int) -> tuple[np.ndarray, np.ndarray]:
@@ -157,8 +198,9 @@ def test_a_restored_run_goes_on_to_the_same_bits(stepper, device, precision):
     scene = with_values(cell(precision=precision), {"numerics.stepper": stepper})
     whole, resumed = (Simulation(scene, device=device) for _ in range(2))
     whole.advance(5e-5)
-    checkpoint = whole.checkpoint()
+    checkpoint, memory = whole.checkpoint(), whole.stepper.memory()
     whole.advance(1e-4)  # what was remembered must not change with it
+    assert all(np.array_equal(values, checkpoint[f"stepper.{name}"]) for name, values in memory.items())
     resumed.restore(checkpoint)
     assert resumed.times[0] == 5e-5
     resumed.advance(1e-4)

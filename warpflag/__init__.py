@@ -3,13 +3,38 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from warpflag.record import Record
+    from warpflag.recorder import Recorder
+    from warpflag.scene import Scene, SceneError, load, with_values
+    from warpflag.simulation import NumericalError, Simulation
 
 __version__ = "0.1.0"
-__all__ = ["Scene", "SceneError", "Simulation", "__version__", "load"]
+__all__ = [
+    "NumericalError",
+    "Record",
+    "Recorder",
+    "Scene",
+    "SceneError",
+    "Simulation",
+    "__version__",
+    "load",
+    "with_values",
+]
 
 # Loaded on first use, so that `import warpflag` and the command line's --help stay quick.
-_HOMES = {"Scene": "scene", "SceneError": "scene", "load": "scene", "Simulation": "simulation"}
+_HOMES = {
+    "NumericalError": "simulation",
+    "Record": "record",
+    "Recorder": "recorder",
+    "Scene": "scene",
+    "SceneError": "scene",
+    "Simulation": "simulation",
+    "load": "scene",
+    "with_values": "scene",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels import chart as chart_stage
+from warpflag_kernels import control as control_stage
+from warpflag_kernels import guard
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, Switches, structs
 
 from warpflag.drag import filament_mobility, pair_radius, spheroid_mobility
 from warpflag.geometry import InitialState
 from warpflag.scene import Scene, SceneError
 
-__all__ = ["build_chart", "build_model", "build_state", "switches_of"]
+__all__ = ["build_chart", "build_control", "build_guard", "build_model", "build_state", "switches_of"]
 
 _PAIRS = {"as_printed": "all", "consistent": "all"}
 
@@ -177,6 +179,27 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     chart.body_rate = zeros(cells, chart_stage.vec6d)
     chart.motor_angle, chart.body_angle = zeros(flagella, wp.float64), zeros(cells, wp.float64)
     return chart
+
+
+def build_control(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
+    """The clocks of every cell, at the times of their starts."""
+    cells, device = model.cell_count, model.device
+    c = control_stage.Control()
+    c.time = wp.array([start.time for start in starts], dtype=wp.float64, device=device)
+    c.target, c.longest_step, c.step = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(3))
+    c.steps = wp.zeros(cells, dtype=wp.int32, device=device)
+    c.fault = wp.full(cells, control_stage.NO_FAULT, dtype=wp.int32, device=device)
+    c.unfinished, c.at_rest, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4))
+    return c
+
+
+def build_guard(model: DeviceModel, chart: Any) -> Any:
+    """What the guards remember between two looks."""
+    g = guard.struct(model.precision)()
+    g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
+    if model.switches.steric:
+        g.position = wp.clone(chart.base_position)
+    return g
 
 
 def _lab_axes(q: np.ndarray) -> np.ndarray:

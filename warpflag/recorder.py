@@ -54,6 +54,7 @@ class Recorder:
         self._resume_step = resume_step
         self._file: Any = None
         self._parameters: dict[str, Any] = {}
+        self._datasets: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._committed = 0
         self._pending: list[dict[str, Any]] = []
@@ -119,7 +120,7 @@ class Recorder:
         count = self._committed + len(self._pending)
         for names in ([name for name in self._shapes if name != "step"], ["step"]):
             for name in names:
-                dataset = self._file[dataset_path(name)]
+                dataset = self._datasets[name]
                 dataset.resize(count, axis=0)
                 dataset[self._committed :] = np.stack([values[name] for values in self._pending])
             self._file.flush()
@@ -177,6 +178,7 @@ class Recorder:
             self._write_parameters(file)
         os.replace(temporary, self.path)
         self._file = h5py.File(self.path, "r+")
+        self._datasets = {name: self._file[dataset_path(name)] for name in values}
         self._shapes = {name: np.shape(value) for name, value in values.items()}
 
     def _reopen(self, resume_step: int) -> None:
@@ -193,7 +195,7 @@ class Recorder:
         except OSError as error:
             raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
         for name in names:  # step first: at any moment no dataset is shorter
-            dataset = self._file[dataset_path(name)]
+            dataset = self._datasets[name] = self._file[dataset_path(name)]
             dataset.resize(self._committed, axis=0)
             self._file.flush()
             self._shapes[name] = dataset.shape[1:]

@@ -217,6 +217,11 @@ def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) ->
         raise error.located(path, given) from None
 
 
+def loads(toml: str) -> Scene:
+    """The scene of a TOML text, as `dumps` writes it. Raises SceneError."""
+    return _built(*scene_file.flattened(scene_file.parsed(toml), _SECTIONS))
+
+
 def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
     """A checked copy with other values by dotted key, ``{"motor.torque": 2.0}``; None makes one absent."""
     parts = {"": scene, **{key: getattr(scene, key) for key in _SECTIONS}}

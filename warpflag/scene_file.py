@@ -14,16 +14,24 @@ from warpflag.settings import SceneError, Section, shown, written
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a TOML file; SceneError when it can't be read."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parsed(path.read_text(encoding="utf-8"))
+    except SceneError as error:
+        raise error.located(path) from None
     except FileNotFoundError:
         problem = "no such file"
     except UnicodeDecodeError:
         problem = "is not a text file in UTF-8"
-    except tomllib.TOMLDecodeError as error:
-        problem = f"is not valid TOML: {error}"
     except OSError as error:
         problem = f"can't be read: {error.strerror}"
     raise SceneError(None, None, problem, source=str(path))
+
+
+def parsed(toml: str) -> dict[str, Any]:
+    """The tables of a TOML text; SceneError when it is none."""
+    try:
+        return tomllib.loads(toml)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(None, None, f"is not valid TOML: {error}") from None
 
 
 def flattened(table: Mapping[str, Any], sections: Container[str]) -> tuple[dict[str, Any], int]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,105 +14,28 @@ from warpflag_kernels import control as control_stage
 from warpflag_kernels import elastic, guard, steric
 from warpflag_kernels.types import Precision
 
-from warpflag.geometry import InitialState, initial_state
+from warpflag.cell_state import CellState, Evaluation
+from warpflag.device import find_device
+from warpflag.faults import NumericalError
+from warpflag.frames import frame_of
+from warpflag.geometry import InitialState
 from warpflag.integrators import System, make_stepper
-from warpflag.model import build_chart, build_model, build_state
+from warpflag.model import build_chart, build_control, build_guard, build_model, build_state
+from warpflag.record import Frame
+from warpflag.reporters import Reporter, start_reporter
 from warpflag.scene import Scene
 from warpflag.stages import launch_right_hand_side
+from warpflag.start import starting_state
 
 __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
 _SECONDS_PER_REPLAY = 0.2
-
-_ADVICE = {
-    guard.Fault.NOT_FINITE: ("a value is not finite", "take a shorter numerics.time_step"),
-    guard.Fault.CROSSING: (
-        "its centre line has passed through another flagellum's",
-        "take a shorter numerics.time_step, hydrodynamics.mode other than as_printed, or a lower motor.torque",
-    ),
-    guard.Fault.STRAIN: (
-        "a segment is stretched or squeezed by more than 5 %",
-        "take a shorter numerics.time_step, a lower motor.torque or a higher flagella.stretching_stiffness",
-    ),
-    guard.Fault.TWIST: (
-        "a joint is twisted by more than 90 degrees",
-        "take a shorter flagella.segment_length or a lower motor.torque",
-    ),
-    guard.Fault.FOLD: (
-        "a joint is folded back on itself",
-        "take a shorter numerics.time_step or a lower motor.torque",
-    ),
-}
-
-
-class NumericalError(RuntimeError):
-    """The run has lost its numerical footing: what, when, which flagellum, what to try, in one line.
-
-    Attributes:
-        time: of the step that violated a guard [s].
-        cell, flagellum, segment: where; segment counts from the body, 0 is the motor joint.
-        kind: which guard.
-    """
-
-    def __init__(self, kind: guard.Fault, time: float, cell: int, flagellum: int, segment: int) -> None:
-        self.kind, self.time, self.cell, self.flagellum, self.segment = kind, time, cell, flagellum, segment
-        what, advice = _ADVICE[kind]
-        where = f"flagellum {flagellum}, segment {segment}"
-        super().__init__(f"stopped at {time * 1e3:.6g} ms: {where}: {what}; {advice}")
-
-
-@dataclass(frozen=True)
-class CellState:
-    """One cell at one time, on the host, in lab coordinates.
-
-    Attributes:
-        time: [s].
-        step: steps taken.
-        positions: nodes [um], shape [node_count, 3], flagellum after flagellum, r_0..r_N each.
-        directors: e1 of the tripod and the segments, shape [node_count, 3].
-        tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
-        motor_angle: accumulated turn of each motor relative to the body [rad], shape [flagellum_count].
-        body_angle: accumulated turn of the body about its axis e_b3 [rad].
-        body_position: [um], shape [3].
-        body_orientation: quaternion (x, y, z, w), shape [4].
-        elastic_energy: bending, twist, stretching [pN um], shape [3].
-        steric_force: sum of the contact forces between flagella, each pair once [pN].
-    """
-
-    time: float
-    step: int
-    positions: np.ndarray
-    directors: np.ndarray
-    tangents: np.ndarray
-    motor_angle: np.ndarray
-    body_angle: float
-    body_position: np.ndarray
-    body_orientation: np.ndarray
-    elastic_energy: np.ndarray
-    steric_force: float
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Forces and velocities of one cell at its present state.
-
-    Attributes:
-        forces: on the nodes [pN], shape [node_count, 3]; on r_0: what the anchor hands to the body.
-        torques: on the spins about the tangents [pN um], shape [node_count].
-        velocities: of the nodes in the lab [um/s], shape [node_count, 3].
-        spins: of the segments about their tangents [rad/s], shape [node_count].
-        body_force, body_torque: on the body, all shares [pN], [pN um], shape [3]; torque about its centre.
-        body_velocity, body_spin: of the body [um/s], [rad/s], shape [3].
-    """
-
-    forces: np.ndarray
-    torques: np.ndarray
-    velocities: np.ndarray
-    spins: np.ndarray
-    body_force: np.ndarray
-    body_torque: np.ndarray
-    body_velocity: np.ndarray
-    body_spin: np.ndarray
+_ROUNDING = 1e-6  # of a frame interval: times this close are the same
+# Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
+_CARRIED = (
+    *("base_position", "base_tangent", "base_director", "base_body_position", "base_body_orientation"),
+    *("flagellum_spin", "motor_angle", "body_angle"),
+)
 
 
 class Simulation:
@@ -122,12 +45,14 @@ class Simulation:
         scenes: one scene, or one per cell of a batch. All of a batch share precision, stepper and switches.
         device: "cpu", "cuda:0", ...; default: Warp's preferred one.
         starts: initial shapes, one per scene; default: from the scenes.
+        reporters: take the frames of the next `run` of a single scene, and are closed and let go at its end.
         capture: replay a captured pass (the default) or launch every kernel from Python; same numbers.
         strict: kernels built without reassociation, for comparisons to the last bit.
 
     Errors:
         SceneError: a scene can't be simulated.
-        NumericalError: from `advance`, when a guard is violated.
+        DeviceError: there is no such device.
+        NumericalError: from `advance`, `frames` and `run`, when a guard is violated.
     """
 
     def __init__(
@@ -136,24 +61,26 @@ class Simulation:
         *,
         device: Any = None,
         starts: InitialState | Sequence[InitialState] | None = None,
+        reporters: Sequence[Reporter] = (),
         capture: bool = True,
         strict: bool = False,
     ) -> None:
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         if starts is None:
-            starts = [initial_state(scene) for scene in self.scenes]
+            starts = [starting_state(scene) for scene in self.scenes]
         elif isinstance(starts, InitialState):
             starts = [starts]
         precision = Precision(self.scenes[0].numerics.precision, strict)
-        model = build_model(self.scenes, device, precision)
+        model = build_model(self.scenes, find_device(device), precision)
         self.device = model.device
         state = build_state(model)
         chart = build_chart(model, starts)
-        self.system = System(model, state, chart, _control(model.cell_count, starts, self.device), _guard(model))
-        self.system.guard.position.assign(chart.base_position)
+        self.system = System(model, state, chart, build_control(model, starts), build_guard(model, chart))
         self.stepper = make_stepper(self.system, self.scenes)
-        self._first_node = model.data.first_node.numpy()
+        self.first_node = model.data.first_node.numpy()
         self._first_flagellum = model.data.first_flagellum.numpy()
+        self.reporters = list(reporters)
+        self._framed: CellState | None = None
         self._capture, self._graph = capture, None
         self._passes_per_replay = 200
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
@@ -162,12 +89,72 @@ class Simulation:
     @property
     def times(self) -> np.ndarray:
         """Simulated time of every cell [s], shape [cell_count]."""
-        return self.system.control.time.numpy()
+        return self.system.control.time.numpy().copy()
 
     @property
     def steps(self) -> np.ndarray:
         """Steps taken by every cell, shape [cell_count]."""
-        return self.system.control.steps.numpy()
+        return self.system.control.steps.numpy().copy()
+
+    @property
+    def state(self) -> CellState:
+        """The first cell on the host, at the time it has reached."""
+        return self.cell_state()
+
+    def run(self, duration: float | None = None) -> None:
+        """Advances by a simulated time [s], by default to the end of the scene, and hands frames to the reporters.
+
+        Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state.
+        """
+        until = self.scenes[0].duration if duration is None else float(self.times[0]) + duration
+        reporters, self.reporters = self.reporters, []
+        try:
+            for reporter in reporters:
+                start_reporter(reporter, self.scenes[0], self.first_node)
+            for frame in self.frames(until) if reporters else ():
+                for reporter in reporters:
+                    reporter.write(frame)
+        finally:
+            for reporter in reporters:
+                reporter.close()
+        self.advance(until)
+
+    def frames(self, until: float, watch: Callable[[float], None] | None = None) -> Iterator[Frame]:
+        """Advances one scene to a time and yields a frame at each multiple of its duration / frames on the way.
+
+        Args:
+            until: simulated time to reach [s].
+            watch: as in `advance`.
+
+        Errors:
+            ValueError: several scenes; their cells are advanced together and read with `cell_state`.
+        """
+        if len(self.scenes) > 1:
+            raise ValueError("frames and reporters are of a single scene; advance a batch and read cell_state(cell)")
+        scene, first_node = self.scenes[0], self.first_node
+        length = float(np.mean([spec.length for spec in scene.resolved_flagella()]))
+        if self._framed is None:
+            self._framed = self._placed_state()
+            yield frame_of(self._framed, None, first_node, length)
+        k = math.floor(float(self.times[0]) / scene.duration * scene.frames + _ROUNDING)
+        last = math.floor(until / scene.duration * scene.frames + _ROUNDING)
+        while k < last:
+            k += 1
+            self.advance(scene.duration * k / scene.frames, watch)
+            before, self._framed = self._framed, self.cell_state()
+            yield frame_of(self._framed, before, first_node, length)
+
+    def prepare(self) -> None:
+        """Compiles and loads every kernel and captures the pass; otherwise the first `advance` does."""
+        if not self._capture or self._graph is not None:
+            return
+        # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
+        # changes nothing.
+        self.system.control.at_rest.fill_(1)
+        self.stepper.launch_pass()
+        with wp.ScopedCapture(device=self.device) as captured:
+            wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
+        self._graph = captured.graph
 
     def advance(self, until: float, watch: Callable[[float], None] | None = None) -> None:
         """Advances every cell to one time.
@@ -182,7 +169,9 @@ class Simulation:
         control, state = self.system.control, self.system.state.data
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
         if not waiting.any():
+            self._raise_fault()
             return
+        self.prepare()
         control.target.fill_(until)
         state.active.assign(waiting.astype(np.int32))
         control.unfinished.fill_(int(waiting.sum()))
@@ -223,13 +212,43 @@ class Simulation:
             steric_force=steric_force,
         )
 
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
+        own = {name: array.numpy().copy() for name, array in self._carried().items()}
+        return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes back what `checkpoint` gave, in a simulation of the same scenes.
+
+        Errors:
+            ValueError: the arrays are of another simulation.
+        """
+        carried = self._carried()
+        memory = {name.partition(".")[2]: values for name, values in arrays.items() if name.startswith("stepper.")}
+        if carried.keys() != arrays.keys() - {f"stepper.{name}" for name in memory}:
+            raise ValueError("the checkpoint is of another version or another stepper")
+        if memory.keys() != self.stepper.memory().keys():
+            raise ValueError("the checkpoint is of another stepper")
+        for name, array in carried.items():
+            if array.numpy().shape != arrays[name].shape:
+                raise ValueError(f"the checkpoint is of other cells: {name} has the shape {arrays[name].shape}")
+            array.assign(arrays[name])
+        self.stepper.restart()
+        self.stepper.recall(memory)
+        self._framed = self._placed_state()
+
+    def _carried(self) -> dict[str, Any]:
+        control, chart = self.system.control, self.system.chart
+        carried = {"control.time": control.time, "control.steps": control.steps}
+        carried |= {f"chart.{name}": getattr(chart, name) for name in _CARRIED}
+        if self.system.model.switches.steric:
+            carried["guard.position"] = self.system.guard.position
+        return carried
+
     def evaluate(self, cell: int = 0) -> Evaluation:
         """Forces and velocities of one cell at its present state; advances nothing."""
-        model, s, chart = self.system.model, self.system.state, self.system.chart
-        s.data.active.fill_(1)
-        for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
-            array.zero_()
-        chart_stage.place(model, s, chart)
+        model, s = self.system.model, self.system.state
+        self._place()
         launch_right_hand_side(model, s)
         s.data.active.zero_()
         flagella, nodes = self._own(cell)
@@ -238,7 +257,7 @@ class Simulation:
             return array.numpy()[part].astype(np.float64)
 
         torques = host(s.data.spin_torque, nodes)
-        mobility = np.repeat(model.data.spin_mobility.numpy(), np.diff(self._first_node))[nodes]
+        mobility = np.repeat(model.data.spin_mobility.numpy(), np.diff(self.first_node))[nodes]
         return Evaluation(
             forces=host(s.data.force, nodes),
             torques=torques,
@@ -253,49 +272,34 @@ class Simulation:
     def _own(self, cell: int) -> tuple[slice, slice]:
         """The flagella and the nodes of one cell."""
         flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
-        return flagella, slice(self._first_node[flagella.start], self._first_node[flagella.stop])
+        return flagella, slice(self.first_node[flagella.start], self.first_node[flagella.stop])
 
     def _replay(self) -> None:
-        control = self.system.control
-        if not self._capture:
-            while control.proceed.numpy()[0] > 0:
-                self.stepper.launch_pass()
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
             return
-        if self._graph is None:
-            # Compile and load every kernel before the capture, with no cell taking part.
-            active = self.system.state.data.active
-            waiting = active.numpy().copy()
-            active.zero_()
+        while self.system.control.proceed.numpy()[0] > 0:
             self.stepper.launch_pass()
-            active.assign(waiting)
-            control.proceed.fill_(1)
-            with wp.ScopedCapture(device=self.device) as captured:
-                wp.capture_while(control.proceed, self.stepper.launch_pass)
-            self._graph = captured.graph
-        wp.capture_launch(self._graph)
+
+    def _place(self) -> None:
+        """Puts the evaluation point on the present state; every cell is active afterwards."""
+        s, chart = self.system.state, self.system.chart
+        s.data.active.fill_(1)
+        for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
+            array.zero_()
+        chart_stage.place(self.system.model, s, chart)
+
+    def _placed_state(self) -> CellState:
+        """The first cell before any step, or after a state was set from outside."""
+        self._place()
+        self.system.state.data.active.zero_()
+        return self.cell_state()
 
     def _raise_fault(self) -> None:
         faults = self.system.control.fault.numpy()
         for cell in np.flatnonzero(faults != control_stage.NO_FAULT):
             kind, element = guard.decode(int(faults[cell]))
-            flagellum = int(np.searchsorted(self._first_node, element, side="right")) - 1
-            segment = element - int(self._first_node[flagellum])
+            flagellum = int(np.searchsorted(self.first_node, element, side="right")) - 1
+            segment = element - int(self.first_node[flagellum])
             own = flagellum - int(self._first_flagellum[cell])
             raise NumericalError(kind, float(self.times[cell]), int(cell), own, segment)
-
-
-def _control(cells: int, starts: Sequence[InitialState], device: Any) -> Any:
-    c = control_stage.Control()
-    c.time = wp.array([start.time for start in starts], dtype=wp.float64, device=device)
-    c.target, c.longest_step, c.step = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(3))
-    c.steps = wp.zeros(cells, dtype=wp.int32, device=device)
-    c.fault = wp.full(cells, control_stage.NO_FAULT, dtype=wp.int32, device=device)
-    c.unfinished, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
-    return c
-
-
-def _guard(model: Any) -> Any:
-    g = guard.struct(model.precision)()
-    g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
-    g.position = wp.zeros(model.element_count, dtype=model.precision.vec3, device=model.device)
-    return g

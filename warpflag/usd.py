@@ -1,17 +1,15 @@
-"""The movie of a record, movie.usdc: one curve set for all flagella, a capsule for the body, camera and
-lights.
+"""The movie of a record, movie.usdc: a shot that plays as it is, with cells, camera, lights and colours.
 
-Units and time: 1 scene unit is 1 um (metersPerUnit 1e-6), z is up, time code = frame index. Played at its 50
-frames per second, the film is slower than the cell by the factor in customLayerData; the simulated time is a
-custom attribute of the cell.
+Units and time: 1 scene unit is 1 um (metersPerUnit 1e-6), z is up, time code = frame index. Played at its rate the
+film is slower than the cell by the factor in customLayerData; the simulated time is a custom attribute of the cell.
 
-    /World                       assembly /World/Cell                  component; custom attribute
-    warpflag:time [s], time-sampled /World/Cell/Body             Capsule along its z axis, translated and
-    oriented per frame /World/Cell/Flagella         BasisCurves (catmullRom, pinned: they pass through every
-    node), points per frame /World/Cell/Looks            materials: UsdPreviewSurface with the display colour
-    /World/Camera, /World/Lights the camera holds the whole path in view
+    /World         assembly
+    /World/Cell    what `warpflag.usd_cell` describes; of several records Cell_0, Cell_1, ... side by side
+    /World/Camera  holds the whole path in view, or follows the cell
+    /World/Lights
 
-The points have the order of the record's nodes.
+The points have the order of the record's nodes. What outgrows 256 MiB is written as value clips, files of so many
+frames each in the folder NAME_clips beside the movie; a program that opens the movie finds them.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
@@ -19,206 +17,243 @@ The points have the order of the record's nodes.
 
 from __future__ import annotations
 
-import os
+import contextlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
+from warpflag.coloring import QUANTITIES
+from warpflag.output import OutputError, whole
 from warpflag.record import Record, RecordError
+from warpflag.scene import loads
+from warpflag.usd_cell import Cell
+from warpflag.usd_shot import Extent, add_camera, add_lights, arranged, steady_path, view_axes
 
-__all__ = ["FRAMES_PER_SECOND", "write_movie"]
+__all__ = ["Shot", "movie_stage", "write_movie"]
 
-FRAMES_PER_SECOND = 50.0
-
-_BODY_COLOR = (0.72, 0.74, 0.70)
-# Okabe & Ito's colours, told apart by colour-blind eyes too; repeated beyond eight flagella.
-_FLAGELLUM_COLORS = (
-    (0.84, 0.37, 0.00),
-    (0.00, 0.45, 0.70),
-    (0.00, 0.62, 0.45),
-    (0.80, 0.47, 0.65),
-    (0.90, 0.62, 0.00),
-    (0.34, 0.71, 0.91),
-    (0.94, 0.89, 0.26),
-    (0.45, 0.45, 0.45),
-)
-_APERTURE = (36.0, 20.25)  # 16:9, in tenths of a scene unit as the focal length; only their ratio counts
-_FOCAL_LENGTH = 50.0
-_FRAMING_MARGIN = 1.1
+SUFFIXES = (".usdc", ".usda", ".usdz")
+_CLIP_BYTES = 1 << 28
+_BLOCK_BYTES = 1 << 21
+_BYTES_PER_NODE = 28  # point, colour and raw value
 
 
-def write_movie(record: Record, path: str | Path) -> None:
-    """Writes the movie of a record under a temporary name and renames it: `path` (ending .usdc) is whole or
-    absent.
+@dataclass(frozen=True)
+class Shot:
+    """How a record is filmed.
 
-    Raises RecordError for a record without frames, OSError where the file can't be written.
+    color_by: flagellum, phase_difference, curvature or steric_force. follow: the camera goes with the cell.
+    frames_per_second: of the film. slow_down: how much slower than the cell it plays; None: one frame of the record
+    per frame of the film. clip_frames: frames per value clip; None: one file as long as its samples fit in 256 MiB.
+
+    Raises OutputError for values that make no film.
     """
-    from pxr import Sdf, Usd, UsdGeom
 
-    path = Path(path)
-    if record.frame_count == 0:
-        raise RecordError(f"{record.path}: holds no frames to make a movie of")
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.micrometers)
-    stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
-    stage.SetFramesPerSecond(FRAMES_PER_SECOND)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(record.frame_count - 1)
-    world = UsdGeom.Xform.Define(stage, "/World")
-    stage.SetDefaultPrim(world.GetPrim())
-    Usd.ModelAPI(world).SetKind("assembly")
-    cell = UsdGeom.Xform.Define(stage, "/World/Cell")
-    Usd.ModelAPI(cell).SetKind("component")
-    time = cell.GetPrim().CreateAttribute("warpflag:time", Sdf.ValueTypeNames.Double, custom=True)
-    time.SetDocumentation("Simulated time [s].")
-    for frame, value in enumerate(record.times):
-        time.Set(float(value), frame)
+    color_by: str = "flagellum"
+    follow: bool = False
+    frames_per_second: float = 50.0
+    slow_down: float | None = None
+    clip_frames: int | None = None
 
-    _add_body(stage, record)
-    view = _view_axes(record)
-    bounds = _add_flagella(stage, record, view)
-    _add_camera(stage, view, bounds)
-    _add_lights(stage, view)
-    stage.GetRootLayer().customLayerData = {"warpflag": _provenance(record)}
+    def __post_init__(self) -> None:
+        if self.color_by not in QUANTITIES:
+            raise OutputError(f"color {self.color_by}: must be one of {', '.join(QUANTITIES)}")
+        for name in ("frames_per_second", "slow_down", "clip_frames"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise OutputError(f"{name.replace('_', ' ')} {value:g}: must be positive and finite")
 
-    temporary = path.with_name(f".{path.stem}.tmp.usdc")
-    if not stage.GetRootLayer().Export(str(temporary)):
+
+def write_movie(records: Record | Sequence[Record], path: str | Path, shot: Shot | None = None) -> None:
+    """Writes the movie of a record, or of several cells side by side; `path` is whole or absent.
+
+    path: ends in .usdc, .usda (text) or .usdz (one file that phones and web viewers open).
+
+    Raises RecordError for records without frames or with unequal frame intervals, OutputError for another ending,
+    OSError where the file can't be written.
+    """
+    path, shot = Path(path), shot or Shot()
+    if path.suffix not in SUFFIXES:
+        raise OutputError(f"{path}: a movie must end in {', '.join(SUFFIXES)}")
+    film = _Film(records, shot)
+    token = uuid4().hex[:8]
+    clips = path.with_name(f"{path.stem}_clips")
+    if path.suffix != ".usdz" and film.clip_frames < film.frame_count:
+        film.write_clips(clips, token)
+    else:
+        film.fill()
+    film.finish()
+    with whole(path) as temporary:
+        (_package if path.suffix == ".usdz" else _export)(film.stage, temporary)
+    for stale in clips.glob("*.usdc"):
+        if not stale.name.startswith(token):
+            stale.unlink()
+    with contextlib.suppress(OSError):
+        clips.rmdir()  # where no clips are left
+
+
+def movie_stage(records: Record | Sequence[Record], shot: Shot | None = None) -> Any:
+    """The movie as a stage in memory. Raises as `write_movie` does."""
+    film = _Film(records, shot or Shot())
+    film.fill()
+    film.finish()
+    return film.stage
+
+
+def _export(stage: Any, path: Path) -> None:
+    if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"{path}: the movie could not be written")
-    os.replace(temporary, path)
 
 
-def _provenance(record: Record) -> dict[str, Any]:
-    """What the file says of its origin; the slow-down is that of the mean frame interval, 0 for a single
-    frame."""
+def _package(stage: Any, path: Path) -> None:
+    from pxr import Sdf, UsdUtils
+
+    with tempfile.TemporaryDirectory() as folder:
+        layer = Path(folder) / "movie.usdc"
+        _export(stage, layer)
+        if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(path)):
+            raise OSError(f"{path}: the movie could not be packed")
+
+
+class _Film:
+    """A stage in the making: cells, their samples, and at last the camera that has seen them all."""
+
+    def __init__(self, records: Record | Sequence[Record], shot: Shot):
+        from pxr import Usd
+
+        self.records = [records] if isinstance(records, Record) else list(records)
+        self.frame_count = _frame_count(self.records)
+        scenes = [loads(record.scene_text) for record in self.records]
+        self.stage = Usd.Stage.CreateInMemory()
+        self._shot = shot
+        self._define_world()
+        names = ["Cell"] if len(self.records) == 1 else [f"Cell_{k}" for k in range(len(self.records))]
+        cells = zip(names, self.records, scenes, strict=True)
+        self._cells = [Cell(self.stage, f"/World/{name}", *cell, shot.color_by) for name, *cell in cells]
+        self._view = view_axes(self.records[0].body_orientation[0])
+        self._path = self._followed() if shot.follow else np.zeros((self.frame_count, 3))
+        self._extents = [Extent(self._view, self._path) for _ in self._cells]
+
+    @property
+    def clip_frames(self) -> int:
+        """Frames per value clip; at least as many as there are means none."""
+        return int(self._shot.clip_frames or max(1, _CLIP_BYTES // self._frame_bytes))
+
+    @property
+    def _frame_bytes(self) -> int:
+        return _BYTES_PER_NODE * max(1, sum(int(record.first_node[-1]) for record in self.records))
+
+    def fill(self) -> None:
+        """Puts all samples into the stage."""
+        self._fill(self.stage.GetRootLayer(), 0, self.frame_count)
+
+    def write_clips(self, folder: Path, token: str) -> None:
+        """Writes the samples as value clips, TOKEN_NUMBER.usdc in a folder, and refers to them.
+
+        Each clip also holds the first frame of the next: between the two the film still moves.
+        """
+        from pxr import Gf, Sdf, Usd, Vt
+
+        folder.mkdir(exist_ok=True)
+        starts = range(0, self.frame_count, self.clip_frames)
+        names = [f"{token}_{number:04d}.usdc" for number in range(len(starts))]
+        for start, name in zip(starts, names, strict=True):
+            clip = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
+            self._fill(clip, start, min(start + self.clip_frames + 1, self.frame_count))
+            clip.Export(str(folder / name))
+        manifest = f"{token}_manifest.usdc"
+        self._declared(Sdf.Layer.CreateAnonymous(".usdc")).Export(str(folder / manifest))
+        last = self.frame_count - 1
+        for cell in self._cells:
+            clips = Usd.ClipsAPI(cell.prim)
+            clips.SetClipPrimPath(str(cell.prim.GetPath()))
+            clips.SetClipAssetPaths([Sdf.AssetPath(f"./{folder.name}/{name}") for name in names])
+            clips.SetClipManifestAssetPath(Sdf.AssetPath(f"./{folder.name}/{manifest}"))
+            clips.SetClipActive(Vt.Vec2dArray([Gf.Vec2d(start, number) for number, start in enumerate(starts)]))
+            clips.SetClipTimes(Vt.Vec2dArray([Gf.Vec2d(0, 0), Gf.Vec2d(last, last)]))
+
+    def finish(self) -> None:
+        """Places cells, camera and lights, once all samples have passed."""
+        from pxr import Gf
+
+        places, box = arranged([extent.box for extent in self._extents])
+        if len(self._cells) > 1:
+            for cell, place in zip(self._cells, places, strict=True):
+                cell.xform.AddTranslateOp().Set(Gf.Vec3d(*(place @ self._view).tolist()))
+        add_camera(self.stage, self._view, box, self._path if self._shot.follow else None)
+        add_lights(self.stage, self._view)
+        self.stage.GetRootLayer().customLayerData = {"warpflag": self._provenance()}
+
+    def _define_world(self) -> None:
+        from pxr import Usd, UsdGeom
+
+        stage, shot = self.stage, self._shot
+        interval = _interval(self.records[0])
+        rate = shot.frames_per_second
+        if shot.slow_down is not None and interval > 0.0:
+            rate = 1.0 / (shot.slow_down * interval)
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+        UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.micrometers)
+        stage.SetTimeCodesPerSecond(rate)
+        stage.SetFramesPerSecond(shot.frames_per_second)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(self.frame_count - 1)
+        world = UsdGeom.Xform.Define(stage, "/World")
+        stage.SetDefaultPrim(world.GetPrim())
+        Usd.ModelAPI(world).SetKind("assembly")
+
+    def _provenance(self) -> dict[str, Any]:
+        """What the file says of its origin and its colours; the slow-down is 0 for a single frame."""
+        first, coloring = self.records[0], self._cells[0].coloring
+        interval = _interval(first)
+        return {
+            "version": first.versions.get("warpflag", "unknown"),
+            "sceneSha256": first.scene_sha256,
+            "frameInterval": interval,
+            "slowDown": 1.0 / (self.stage.GetTimeCodesPerSecond() * interval) if interval > 0.0 else 0.0,
+            "colorBy": coloring.quantity,
+            "colorLabel": coloring.label,
+            "colorHighest": coloring.highest,
+        }
+
+    def _followed(self) -> Any:
+        """The mean steady path of the bodies; a cell whose record ends earlier stays where it is."""
+        paths = [steady_path(record.body_position) for record in self.records]
+        paths = [np.pad(path, ((0, self.frame_count - len(path)), (0, 0)), mode="edge") for path in paths]
+        return np.mean(paths, axis=0)
+
+    def _declared(self, layer: Any) -> Any:
+        from pxr import Sdf
+
+        for cell in self._cells:
+            for path, kind in cell.animated.items():
+                Sdf.JustCreatePrimAttributeInLayer(layer, path, kind)
+        return layer
+
+    def _fill(self, layer: Any, start: int, end: int) -> None:
+        block = max(1, _BLOCK_BYTES // self._frame_bytes)
+        for cell, extent, record in zip(self._cells, self._extents, self.records, strict=True):
+            for first in range(start, min(end, record.frame_count), block):
+                frames = slice(first, min(first + block, end, record.frame_count))
+                for path, frame, value in cell.samples(frames, extent):
+                    layer.SetTimeSample(path, frame, value)
+
+
+def _frame_count(records: Sequence[Record]) -> int:
+    """Of the longest record; raises RecordError where they make no film."""
+    for record in records:
+        if record.frame_count == 0:
+            raise RecordError(f"{record.path}: holds no frames to make a movie of")
+        if abs(_interval(record) - _interval(records[0])) > 1e-6 * _interval(records[0]):
+            raise RecordError(f"{record.path}: its frames are not as far apart as those of {records[0].path}")
+    return max(record.frame_count for record in records)
+
+
+def _interval(record: Record) -> float:
+    """Mean time from frame to frame [s], 0 of a single one."""
     times = record.times
-    interval = float(times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
-    return {
-        "version": record.versions.get("warpflag", "unknown"),
-        "sceneSha256": record.scene_sha256,
-        "frameInterval": interval,
-        "slowDown": 1.0 / (FRAMES_PER_SECOND * interval) if interval > 0.0 else 0.0,
-    }
-
-
-def _add_body(stage: Any, record: Record) -> None:
-    from pxr import Gf, UsdGeom
-
-    radius, height = 0.5 * record.body_width, record.body_length - record.body_width
-    body = UsdGeom.Capsule.Define(stage, "/World/Cell/Body")
-    body.CreateAxisAttr(UsdGeom.Tokens.z)
-    body.CreateRadiusAttr(radius)
-    body.CreateHeightAttr(height)
-    corner = Gf.Vec3f(radius, radius, 0.5 * height + radius)
-    body.CreateExtentAttr([-corner, corner])
-    translate = body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
-    orient = body.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
-    poses = zip(record.body_position, record.body_orientation, strict=True)
-    for frame, (position, (x, y, z, w)) in enumerate(poses):
-        translate.Set(Gf.Vec3d(*map(float, position)), frame)
-        orient.Set(Gf.Quatd(float(w), float(x), float(y), float(z)), frame)
-    body.CreateDisplayColorAttr([Gf.Vec3f(*_BODY_COLOR)])
-    _bind_material(stage, body.GetPrim(), "BodyMaterial", roughness=0.6)
-
-
-def _add_flagella(stage: Any, record: Record, view: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The curves of all flagella. Returns the bounds of the whole path in the camera's axes, shape [2, 3]."""
-    from pxr import UsdGeom, Vt
-
-    curves = UsdGeom.BasisCurves.Define(stage, "/World/Cell/Flagella")
-    curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
-    curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
-    curves.CreateWrapAttr(UsdGeom.Tokens.pinned)
-    counts = np.diff(record.first_node)
-    curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(counts.astype(np.int32)))
-    radius = record.filament_radius
-    curves.CreateWidthsAttr([2.0 * radius])
-    curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-    colors = np.array([_FLAGELLUM_COLORS[k % len(_FLAGELLUM_COLORS)] for k in range(len(counts))], np.float32)
-    curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(colors))
-    points_attribute, extent_attribute = curves.CreatePointsAttr(), curves.CreateExtentAttr()
-    positions = record.positions
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for frame in range(record.frame_count):
-        points = np.ascontiguousarray(positions[frame], dtype=np.float32)
-        extent = np.stack([points.min(axis=0) - radius, points.max(axis=0) + radius]).astype(np.float32)
-        points_attribute.Set(Vt.Vec3fArray.FromNumpy(points), frame)
-        extent_attribute.Set(Vt.Vec3fArray.FromNumpy(extent), frame)
-        in_view = points @ view.T
-        low, high = np.minimum(low, in_view.min(axis=0)), np.maximum(high, in_view.max(axis=0))
-    _bind_material(stage, curves.GetPrim(), "FlagellaMaterial", roughness=0.4)
-    body = record.body_position @ view.T
-    reach = 0.5 * record.body_length
-    return np.stack([np.minimum(low, body.min(axis=0) - reach), np.maximum(high, body.max(axis=0) + reach)])
-
-
-def _bind_material(stage: Any, prim: Any, name: str, roughness: float) -> None:
-    """A plain surface that shows the prim's displayColor, whatever its interpolation."""
-    from pxr import Sdf, UsdShade
-
-    material = UsdShade.Material.Define(stage, f"/World/Cell/Looks/{name}")
-    reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Color"))
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
-    surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
-    surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
-    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
-    output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-    material.CreateSurfaceOutput().ConnectToSource(output)
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
-
-
-def _view_axes(record: Record) -> NDArray[np.float64]:
-    """The camera's right, up and back axes as rows: e_b3, e_b1 and e_b2 of the first frame.
-
-    So the cell lies across the picture and swims to the left, and flagella at azimuth 0 and 180 open in its
-    plane.
-    """
-    x, y, z, w = record.body_orientation[0]
-    e1 = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    e3 = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return np.stack([e3, e1, np.cross(e3, e1)])
-
-
-def _add_camera(stage: Any, view: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
-    """A fixed camera that looks across the box of the whole path from far enough to see all of it."""
-    from pxr import Gf, UsdGeom
-
-    low, high = bounds
-    half_width, half_height, depth = 0.5 * (high[0] - low[0]), 0.5 * (high[1] - low[1]), high[2] - low[2]
-    distance = 2.0 * _FRAMING_MARGIN * _FOCAL_LENGTH * max(half_width / _APERTURE[0], half_height / _APERTURE[1])
-    centre = 0.5 * (low + high)
-    place = np.array([centre[0], centre[1], high[2] + distance]) @ view
-    camera = UsdGeom.Camera.Define(stage, "/World/Camera")
-    camera.CreateFocalLengthAttr(_FOCAL_LENGTH)
-    camera.CreateHorizontalApertureAttr(_APERTURE[0])
-    camera.CreateVerticalApertureAttr(_APERTURE[1])
-    camera.CreateClippingRangeAttr(Gf.Vec2f(0.5 * distance, 2.0 * (distance + depth)))
-    camera.CreateFocusDistanceAttr(distance + 0.5 * depth)
-    camera.AddTransformOp().Set(_placed(view, place))
-
-
-def _add_lights(stage: Any, view: NDArray[np.float64]) -> None:
-    """Soft light from everywhere and a key light over the camera's left shoulder."""
-    from pxr import Gf, UsdGeom, UsdLux
-
-    lights = UsdGeom.Xform.Define(stage, "/World/Lights")
-    lights.AddTransformOp().Set(_placed(view, np.zeros(3)))
-    UsdLux.DomeLight.Define(stage, "/World/Lights/Dome").CreateIntensityAttr(0.5)
-    key = UsdLux.DistantLight.Define(stage, "/World/Lights/Key")
-    key.CreateIntensityAttr(2.0)
-    key.CreateAngleAttr(2.0)
-    key.AddRotateXYZOp().Set(Gf.Vec3f(-40.0, -35.0, 0.0))
-
-
-def _placed(axes: NDArray[np.float64], origin: NDArray[np.float64]) -> Any:
-    """USD's matrix (row vectors) of a frame with these axes as rows, at this origin."""
-    from pxr import Gf
-
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[3, :3] = axes, origin
-    return Gf.Matrix4d(matrix.tolist())
+    return float(times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0

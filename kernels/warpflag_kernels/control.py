@@ -25,6 +25,7 @@ class Control:
     steps: wp.array(dtype=wp.int32)  # taken so far
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
+    at_rest: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
     budget: wp.array(dtype=wp.int32)  # [1], passes left before the host looks again
     proceed: wp.array(dtype=wp.int32)  # [1], the loop condition
 
@@ -39,6 +40,7 @@ def _kernels() -> SimpleNamespace:
         # Out:
         control: Control,
     ):
+        control.at_rest[0] = 0
         control.budget[0] = control.budget[0] - 1
         control.proceed[0] = wp.where(control.unfinished[0] > 0 and control.budget[0] > 0, 1, 0)
 

@@ -127,8 +127,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         moved = wp.max(wp.length(p1n - p1), wp.length(q1n - q1)) + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
         if distance(p1n, q1n - p1n, p2n, q2n - p2n) > moved + touch:
             return False
-        # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; looking
-        # at its sign before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
+        # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign
+        # before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
         a, b, r = q1 - p1, q2 - p2, p2 - p1
         da, db, dr = q1n - p1n - a, q2n - p2n - b, p2n - p1n - r
         mixed = wp.cross(a, db) + wp.cross(da, b)
@@ -233,7 +233,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
-    """Looks at every completed step that is due and notes the first violated guard of each cell in `fault`."""
+    """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
+    `fault`."""
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)

@@ -119,6 +119,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         dt = control.step[c]
         chart.commit[c] = wp.where(j == s, 1, 0)
         chart.rest[c] = wp.where(j == s or j == -1, 1, 0)
+        if j == s or j == -1:
+            control.at_rest[0] = 1
         if j <= 0:
             chart.elapsed[c] = zero
             chart.body_increment[c] = vec6d(zero)

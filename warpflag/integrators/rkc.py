@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -51,7 +52,7 @@ class RkcStepper:
         p, device = model.precision, model.device
         r = rkc.struct(p)()
 
-        def zeros(count: int, dtype: object) -> wp.array:
+        def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
         r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
@@ -72,13 +73,18 @@ class RkcStepper:
         rkc.begin_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
         chart.place(s.model, s.state, s.chart)
         launch_right_hand_side(s.model, s.state)
-        if not self._euler:
-            chart.fit_flagellum_spin(s.model, s.state, s.chart)
+        # Most passes are stages inside a step: what happens between steps is not even launched there.
+        wp.capture_if(s.control.at_rest, self._launch_between_steps)
         chart.increment_rates(s.model, s.state, s.chart)
-        guard.check(s.model, s.state, s.chart, s.guard, s.control)
-        guard.remember(s.model, s.state, s.chart, s.guard, s.control)
         rkc.end_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
         control.count_pass(s.control, s.model.device)
+
+    def _launch_between_steps(self) -> None:
+        s = self._system
+        guard.check(s.model, s.state, s.chart, s.guard, s.control)
+        guard.remember(s.model, s.state, s.chart, s.guard, s.control)
+        if not self._euler:
+            chart.fit_flagellum_spin(s.model, s.state, s.chart)
 
     def restart(self) -> None:
         self.data.stage.fill_(-1)
