@@ -162,7 +162,37 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         if state.active[model.cell_of[e]] != 0 and contacts.own[e] >= 0:
             visit(model, pose, contacts, e, contacts.own[e])
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill)
+    @wp.kernel(module=module)
+    def measure(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        pose: Pose,
+        # Out:
+        contacts: Contacts,
+    ):
+        c, index = wp.tid()
+        if state.active[c] == 0 or index >= contacts.count[c]:
+            return
+        i = contacts.first[c] + index
+        e = contacts.segment[i]
+        j = contacts.other[i]
+        if j < 0:
+            axis = pose.body_axis[c]
+            half = model.body_half_length[c]
+            y = pose.position[e]
+            distance = wp.length(y - wp.clamp(wp.dot(y, axis), -half, half) * axis)
+            contacts.gap[i] = distance - model.body_radius[c]
+        else:
+            p1 = pose.position[e - 1]
+            p2 = pose.position[j - 1]
+            d1 = pose.position[e] - p1
+            d2 = pose.position[j] - p2
+            st = closest_parameters(p1, d1, p2, d2)
+            contacts.gap[i] = wp.length(p1 + st[0] * d1 - p2 - st[1] * d2)
+
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, measure=measure)
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:
@@ -172,3 +202,14 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> No
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts], device=device)
     wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
+
+
+def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, most: int) -> None:
+    """The gaps of the listed contacts at another pose.
+
+    Args:
+        most: launch size, contacts per cell at most.
+    """
+    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    inputs = [model.data, state.data, pose, contacts]
+    wp.launch(kernels.measure, (model.cell_count, most), inputs=inputs, device=model.device)

@@ -121,7 +121,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         # Out:
         x: Increment,
         drive: Increment,
-        zero: Increment,
     ):
         e = wp.tid()
         c = model.cell_of[e]
@@ -131,7 +130,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         gain = real(response_in.gain[c])
         slope = real(imp.ratio[c] / band.step[c])
         carried = last.node[e]
-        zero.node[e] = vec4(real(0.0))
         spin = gain * (model.spin_mobility[k] * state.spin_torque[e] - slope * carried[3])
         v = vec3(real(0.0))
         if e > model.first_node[k]:
@@ -150,7 +148,6 @@ def kernels(p: Precision) -> SimpleNamespace:
             rate = gain * (vec6(u[0], u[1], u[2], w[0], w[1], w[2]) - slope * last.body[c])
             x.body[c] = rate
             drive.body[c] = rate
-            zero.body[c] = vec6(real(0.0))
         x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)

@@ -4,10 +4,11 @@ Column c is the increment Y_c = P(g M B_c) that a unit force at contact c causes
 (on the body where a node is r_0), M is the full mobility with its pair sum, P the factorised system. Eight columns
 travel together as one group, which is what fills a vector register. With W = B^T Y the gaps obey
 
-    gap = r + B^T (e_0 - e) + W F(gap)
+    gap = r + B^T e_0 + W F(gap),
 
-r and B taken at the pose reached by e, and F the steric force law: solved by Newton, in which only closed contacts
-need a factorisation.
+r the gaps of the extrapolated pose and F the steric force law: solved by Newton, in which only closed contacts need
+a factorisation. The pose that this leads to has gaps of its own, since directions turn; `refine` measures them and
+solves once more with the same W.
 """
 
 import functools
@@ -22,7 +23,8 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 GROUP = 8
 NEWTON_ITERATIONS = 60
 HALVINGS = 8
-NEWTON_TOLERANCE = {"float64": 1.0e-7, "float32": 1.0e-5}  # of a gap, in units of sigma
+# Of a gap, in units of sigma: where it only leads to the pose at which the gaps are measured again, and there.
+ROUGH, FINE = 1.0e-3, 1.0e-5
 
 
 @functools.cache
@@ -69,7 +71,6 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
     module = p.module("response", pairs)
     group = wp.constant(GROUP)
     iterations, halvings = wp.constant(NEWTON_ITERATIONS), wp.constant(HALVINGS)
-    newton_tolerance = wp.constant(real(NEWTON_TOLERANCE[p.name]))
 
     @wp.func(module=module)
     def extended(f: vec3):
@@ -315,7 +316,6 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         start: Increment,
-        now: Increment,
         # Out:
         response: Response,
     ):
@@ -324,8 +324,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         if state.active[c] == 0 or index >= count:
             return
         i = contacts_in.first[c] + index
-        free = gap_change(model, state, contacts_in, i, start) - gap_change(model, state, contacts_in, i, now)
-        response.free_gap[i] = contacts_in.gap[i] + free
+        response.free_gap[i] = contacts_in.gap[i] + gap_change(model, state, contacts_in, i, start)
         n = extended(contacts_in.normal[i])
         s = contacts_in.at[i]
         r = contacts_in.at_other[i]
@@ -469,12 +468,30 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             i += 1
 
     @wp.kernel(module=module)
+    def free_gaps(
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        # Out:
+        response: Response,
+    ):
+        c, index = wp.tid()
+        count = contacts_in.count[c]
+        if state.active[c] == 0 or index >= count:
+            return
+        first = contacts_in.first[c]
+        row = response.first_entry[c] + index * count
+        caused = row_product(response.compliance, row, response.force, first, count)
+        response.free_gap[first + index] = contacts_in.gap[first + index] - caused
+
+    @wp.kernel(module=module)
     def solve_gaps(
         # Model:
         model: Model,
         # State:
         state: State,
         contacts_in: Contacts,
+        accuracy: real,
         # Out:
         response: Response,
     ):
@@ -486,7 +503,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         entry = response.first_entry[c]
         strength = model.steric_strength[c]
         diameter = model.steric_diameter[c]
-        tolerance = newton_tolerance * diameter
+        tolerance = accuracy * diameter
         i = int(0)
         while i < count:
             response.solved_gap[first + i] = contacts_in.gap[first + i]
@@ -592,6 +609,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         solve_bodies=solve_bodies,
         follow_bodies=follow_bodies,
         project=project,
+        free_gaps=free_gaps,
         solve_gaps=solve_gaps,
         yield_closed=yield_closed,
         apply_nodes=apply_nodes,
@@ -607,7 +625,6 @@ def respond(
     response: Any,
     groups: int,
     start: Any,
-    now: Any,
     out: Any,
 ) -> None:
     """The increment with contact forces, from the one without.
@@ -615,8 +632,7 @@ def respond(
     Args:
         groups: launch size, groups of columns per cell at most.
         start: increment e_0 without contact forces.
-        now: increment e at which the contacts were found.
-        out: e_0 + Y F; may be `now`.
+        out: e_0 + Y F.
     """
     kernels, device = _kernels(model.precision, model.switches.pairs), model.device
     cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
@@ -625,8 +641,8 @@ def respond(
     wp.launch(kernels.solve_flagella, (flagella, groups), inputs=[*inputs, band, response], device=device)
     wp.launch(kernels.solve_bodies, (cells, groups), inputs=[*inputs, band, response], device=device)
     wp.launch(kernels.follow_bodies, (elements, groups), inputs=[*inputs, band, response], device=device)
-    wp.launch(kernels.project, (cells, groups * GROUP), inputs=[*inputs, start, now, response], device=device)
-    wp.launch(kernels.solve_gaps, cells, inputs=[*inputs, response], device=device)
+    wp.launch(kernels.project, (cells, groups * GROUP), inputs=[*inputs, start, response], device=device)
+    wp.launch(kernels.solve_gaps, cells, inputs=[*inputs, ROUGH, response], device=device)
     wp.launch(kernels.apply_nodes, elements, inputs=[*inputs, response, start, out], device=device)
     inputs = [state.data, contacts_in, response, start, out]
     wp.launch(kernels.apply_bodies, cells, inputs=inputs, device=device)
@@ -645,5 +661,19 @@ def yield_contacts(
     inputs = [model.data, state.data, contacts_in, change, response]
     wp.launch(kernels.yield_closed, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, contacts_in, response, change, out]
+    wp.launch(kernels.apply_nodes, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.apply_bodies, model.cell_count, inputs=inputs[1:], device=device)
+
+
+def refine(
+    model: DeviceModel, state: DeviceState, contacts_in: Any, response: Any, groups: int, start: Any, out: Any
+) -> None:
+    """Solves the contact law again after the gaps have been measured at the pose that it led to."""
+    kernels, device = _kernels(model.precision, model.switches.pairs), model.device
+    inputs = [state.data, contacts_in, response]
+    wp.launch(kernels.free_gaps, (model.cell_count, groups * GROUP), inputs=inputs, device=device)
+    inputs = [model.data, state.data, contacts_in, FINE, response]
+    wp.launch(kernels.solve_gaps, model.cell_count, inputs=inputs, device=device)
+    inputs = [model.data, state.data, contacts_in, response, start, out]
     wp.launch(kernels.apply_nodes, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.apply_bodies, model.cell_count, inputs=inputs[1:], device=device)

@@ -67,7 +67,7 @@ class ImplicitStepper:
 
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
-        self._free_step, self._step, self._zero = (increment() for _ in range(3))
+        self._free_step, self._step = increment(), increment()
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
         self._sweeps = SWEEPS
 
@@ -116,20 +116,19 @@ class ImplicitStepper:
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
         inputs = [model.data, state.data, i, band, self._response, self._carried]
-        inputs += [self._free_step, self._drive, self._zero]
+        inputs += [self._free_step, self._drive]
         wp.launch(k.right_hand_side, model.element_count, inputs=inputs, device=device)
         banded.solve(model, state, band, self._free_step)
         x = self._free_step
         if self._touches:
             x = self._step
-            # Contacts of the extrapolated pose, then of the pose that these contacts lead to.
+            # Contacts of the extrapolated pose, then their gaps in the pose that these lead to.
             contacts.find(model, state, self._now, self._contacts)
-            respond = (model, state, self._contacts, band, self._response, self._groups, self._free_step)
-            response.respond(*respond, self._zero, x)
+            response.respond(model, state, self._contacts, band, self._response, self._groups, self._free_step, x)
             carry = (self._carried, self._carried_before, self._next_last, self._next_before)
             chain.retract(model, state, self._now, i.one, x, self._trial, carry)
-            contacts.find(model, state, self._trial, self._contacts)
-            response.respond(*respond, x, x)
+            contacts.measure(model, state, self._trial, self._contacts, self._groups * response.GROUP)
+            response.refine(model, state, *touching, self._groups, self._free_step, x)
         for _ in range(self._sweeps):
             correction.correct(
                 model, state, self._stiffness, band, *touching, self._drive, x, self._defect, self._scratch
@@ -183,12 +182,12 @@ class ImplicitStepper:
             getattr(self.data, name).assign(values)
 
     def _contact_arrays(self) -> tuple[Any, Any, int]:
-        """Lists and matrices of contacts: one and a half per segment of a cell, a measured bound with room."""
+        """Lists and matrices of contacts: room for three per node of a cell (eight bundled flagella need two)."""
         model = self._system.model
         p, device = model.precision, model.device
         first_node = model.data.first_node.numpy()
         nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
-        groups = np.ceil(1.5 * nodes / response.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
+        groups = np.ceil(3.0 * nodes / response.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
         capacity = groups * response.GROUP
         total = int(capacity.sum())
 
