@@ -15,6 +15,8 @@ import warp as wp
 
 SAMPLES = 3
 """Rays along each side of a pixel that shows more than background."""
+SAMPLES_INSIDE = 2
+"""The same where nothing begins or ends."""
 LIGHT_SAMPLES = SAMPLES * SAMPLES
 SHADOW_CELL = 4
 """Pixels along each side of a cell of the screen's shadow."""
@@ -98,10 +100,19 @@ def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec
 
 
 @wp.func
-def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
-    """Distance to the first capsule on a ray and its index, or _FAR and -1."""
+def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3, guess: wp.int32):
+    """Distance to the first capsule on a ray and its index, or _FAR and -1.
+
+    guess: a capsule that is probably hit, which saves looking behind it; or -1.
+    """
     nearest = _FAR
     hit = int(-1)
+    if guess >= 0:
+        nearest = capsule_hit(
+            origin, direction, capsules.start[guess], capsules.end[guess], capsules.radius[guess]
+        )
+        if nearest < _FAR:
+            hit = guess
     index = int(0)
     query = wp.bvh_query_ray(capsules.bvh, origin, direction)
     while wp.bvh_query_next(query, index, nearest):
@@ -192,7 +203,7 @@ def _find(
     pixel = wp.tid()
     x = float(pixel % view.width) + 0.5
     y = float(pixel // view.width) + 0.5
-    _distance, hit = nearest_hit(capsules, view.eye, ray_through(view, x, y))
+    _distance, hit = nearest_hit(capsules, view.eye, ray_through(view, x, y), -1)
     hit_out[pixel] = hit
 
 
@@ -243,27 +254,41 @@ def _paint(
     pixel = wp.tid()
     column = pixel % view.width
     row = pixel // view.width
+    own = hit[pixel]
     empty = bool(True)
+    inside = bool(True)
     for dy in range(-1, 2):
         for dx in range(-1, 2):
             beside = wp.clamp(column + dx, 0, view.width - 1)
             beyond = wp.clamp(row + dy, 0, view.height - 1)
-            if hit[beyond * view.width + beside] >= 0:
+            other = hit[beyond * view.width + beside]
+            if other >= 0:
                 empty = False
-    color = screen_color(view, shadow, float(column) + 0.5, float(row) + 0.5)
-    if not empty:
-        screen = color
-        color = wp.vec3(0.0)
-        for k in range(LIGHT_SAMPLES):
-            x = float(column) + (float(k % SAMPLES) + 0.5) / float(SAMPLES)
-            y = float(row) + (float(k // SAMPLES) + 0.5) / float(SAMPLES)
-            ray = ray_through(view, x, y)
-            distance, index = nearest_hit(capsules, view.eye, ray)
-            if index < 0:
-                color += screen
-            else:
-                color += surface_color(capsules, view, index, view.eye + distance * ray, ray, view.lights[k])
-        color /= float(LIGHT_SAMPLES)
+            if other < 0 or wp.abs(other - own) > 1:
+                inside = False
+    screen = screen_color(view, shadow, float(column) + 0.5, float(row) + 0.5)
+    side = SAMPLES
+    if inside:
+        side = SAMPLES_INSIDE
+    if empty:
+        side = 0
+    color = wp.vec3(0.0)
+    k = int(0)
+    while k < side * side:
+        x = float(column) + (float(k % side) + 0.5) / float(side)
+        y = float(row) + (float(k // side) + 0.5) / float(side)
+        ray = ray_through(view, x, y)
+        distance, index = nearest_hit(capsules, view.eye, ray, own)
+        if index < 0:
+            color += screen
+        else:
+            light = view.lights[k * LIGHT_SAMPLES // (side * side)]
+            color += surface_color(capsules, view, index, view.eye + distance * ray, ray, light)
+        k += 1
+    if empty:
+        color = screen
+    else:
+        color /= float(side * side)
     for channel in range(3):
         picture_out[3 * pixel + channel] = encoded(color[channel])
 
