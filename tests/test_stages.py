@@ -128,7 +128,7 @@ def test_kernel_arguments_are_grouped_as_model_state_out(path):
         arguments = function.args.args
         head = [line.strip() for line in lines[function.lineno : arguments[-1].lineno - 1]]
         groups = [line for line in head if line.startswith("#")]
-        order = ["# Model:", "# State:", "# Out:"]
+        order = ["# Scene:", "# Model:", "# State:", "# Out:"]  # a scene is what a picture has for a model
         assert groups, f"{path.name}: {function.name}"
         assert groups == [group for group in order if group in groups], f"{path.name}: {function.name}"
         assert head[0] == groups[0], f"{path.name}: {function.name}: arguments before the first group"

@@ -1,0 +1,66 @@
+"""Warp and its devices: started without chatter, found by name, described."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import tempfile
+from typing import Any
+
+__all__ = ["DeviceError", "find_device", "list_devices", "start_warp"]
+
+
+class DeviceError(ValueError):
+    """There is no such device here; one line that says which there are."""
+
+
+@functools.cache
+def start_warp() -> Any:
+    """The module `warp`, initialised, with nothing said below warnings.
+
+    Its library writes to the process's standard error that there is no CUDA driver. On a machine without a GPU that
+    is no news, so what it writes while it starts is caught and only the rest passed on.
+    """
+    import warp as wp
+
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with tempfile.TemporaryFile() as caught:
+            os.dup2(caught.fileno(), 2)
+            try:
+                wp.init()
+            finally:
+                os.dup2(kept, 2)
+            caught.seek(0)
+            lines = caught.read().decode(errors="replace").splitlines(keepends=True)
+    finally:
+        os.close(kept)
+    sys.stderr.write("".join(line for line in lines if "find or load the NVIDIA CUDA driver" not in line))
+    return wp
+
+
+def find_device(name: Any = None) -> Any:
+    """Warp's device of that name ("cpu", "cuda:0"), its preferred one for None.
+
+    Raises DeviceError where there is none.
+    """
+    wp = start_warp()
+    try:
+        return wp.get_device(name)
+    except Exception as error:
+        aliases = ", ".join(device.alias for device in wp.get_devices())
+        raise DeviceError(f"device {name}: not here; this machine has {aliases}") from error
+
+
+def list_devices() -> list[str]:
+    """One line per device: its name for --device, what it is, its memory; the preferred one is marked."""
+    wp = start_warp()
+    lines = []
+    for device in wp.get_devices():
+        memory = f", {device.total_memory / 2**30:.0f} GiB, sm_{device.arch}" if device.is_cuda else ""
+        mark = "  (default)" if device == wp.get_preferred_device() else ""
+        lines.append(f"{device.alias:<8} {device.name}{memory}{mark}")
+    return lines
