@@ -5,29 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from tests.shapes import helix, joined, line
 from warpflag import observables
-
-
-def helix(node_count, *, axis_offset=(0.0, 0.0, 0.0), phase=0.0, radius=0.22, pitch=2.14, h=0.2, handedness=-1):
-    """Nodes of a helix about the z direction and directors across z, which turn with the helix."""
-    turn = 2 * np.pi * radius
-    s = h * np.arange(node_count)
-    angle = handedness * 2 * np.pi * s / np.hypot(turn, pitch) + phase
-    nodes = np.stack([radius * np.cos(angle), radius * np.sin(angle), pitch * s / np.hypot(turn, pitch)], axis=-1)
-    tangents = observables.segment_tangents(nodes)
-    directors = np.cross([0.0, 0.0, 1.0], tangents)
-    directors /= np.linalg.norm(directors, axis=1, keepdims=True)
-    return nodes + axis_offset, np.vstack([[1.0, 0.0, 0.0], directors])
-
-
-def line(node_count, *, x=0.0, y=0.0, h=0.2, tilt=0.0):
-    """Nodes of a straight line along z; tilt moves it along x by so much per unit of z."""
-    z = h * np.arange(node_count)
-    return np.stack([x + tilt * z, np.full_like(z, y), z], axis=-1)
-
-
-def joined(*flagella):
-    return np.concatenate(flagella), np.cumsum([0, *(len(nodes) for nodes in flagella)])
 
 
 def rotation(axis, angle):
@@ -174,6 +153,31 @@ def test_bundle_ends_at_the_first_gap_and_may_start_behind_the_anchors():
     assert not near[:2].any() and near[5:14].all() and not near[16:18].any() and near[20:31].all()
     assert 13 / 30 <= fractions[0] <= 15 / 30
     assert fractions[1] == pytest.approx(14 / 30)
+
+
+def test_a_gap_may_be_passed_over():
+    """Bundled but for a stretch of 0.8 um, and some near the motor that touch before the bundle begins."""
+    straight, other = line(31), line(31, x=0.3)
+    other[3:7, 0], other[24:, 0] = 2.0, 2.0
+    plain = observables.bundled_fraction(*joined(straight, other))
+    assert (plain < 0.2).all()
+    steady = observables.bundled_fraction(*joined(straight, other), gap=1.0)
+    np.testing.assert_allclose(steady, [24 / 30, 23 / 30], atol=1 / 30)
+    np.testing.assert_array_equal(observables.bundled_fraction(*joined(straight, other), gap=0.2), plain)
+    # The gap is a length: with half the segment length it is the same stretch.
+    fine = joined(
+        *(np.array([np.interp(np.arange(61) / 2, np.arange(31), x) for x in f.T]).T for f in (straight, other))
+    )
+    np.testing.assert_allclose(observables.bundled_fraction(*fine, gap=1.0), steady, atol=1 / 30)
+
+
+def test_zip_is_complete_once_it_holds():
+    times = 1e-4 * np.arange(10)
+    lengths = np.array([0.1, 0.98, 0.5, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0])
+    for hold, expected in ((0.0, 1e-4), (1e-4, 3e-4), (2e-4, 6e-4), (3e-4, 6e-4)):
+        assert observables.zip_time(times, lengths, hold) == pytest.approx(expected)
+    assert np.isnan(observables.zip_time(times, lengths, 4e-4))
+    assert np.isnan(observables.zip_time(times, np.full(10, 0.97)))
 
 
 def test_distance_is_to_segments_not_to_nodes():

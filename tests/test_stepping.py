@@ -122,7 +122,7 @@ def coefficients(sim: Simulation, stages: int) -> tuple[np.ndarray, np.ndarray]:
     rows, times = [], []
     for j in range(1, stages + 1):
         data.stage.fill_(j)
-        rkc.begin_pass(s.model, s.state, s.chart, s.control, data, euler=False)
+        rkc.begin_pass(s.model, s.state, s.chart, s.control, sim.stepper.steps, data, euler=False)
         assert data.stages.numpy()[0] == stages
         assert s.chart.commit.numpy()[0] == (j == stages)
         rows.append(data.coefficients.numpy()[0].copy())

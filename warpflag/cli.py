@@ -1,4 +1,4 @@
-"""The command line: `warpflag run`, `check`, `export`, `devices`.
+"""The command line: `warpflag run`, `check`, `plot`, `export`, `devices`.
 
 Exit status: 0 done; 2 bad input, told in one line; 3 a guard stopped the run; 130 interrupted, resumable. Everything
 heavy is imported by the command that needs it.
@@ -92,6 +92,22 @@ def _parser() -> argparse.ArgumentParser:
             "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="replace values of the scene"
         )
 
+    plot = commands.add_parser(
+        "plot",
+        help="draw the curves of runs",
+        description="Draws bundle length, phase difference and contact force of runs over time; needs matplotlib, the "
+        "extra plot. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
+    )
+    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory")
+    plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
+    plot.add_argument(
+        "--as",
+        dest="kind",
+        choices=("series", "comparison"),
+        help="panels with contact forces, or one of all runs (default: series of one run, comparison of several)",
+    )
+    plot.set_defaults(command=_plot)
+
     export = commands.add_parser(
         "export", help="write a record in another format", description="Writes the record of a run in another format."
     )
@@ -144,6 +160,20 @@ def _scene(options: argparse.Namespace) -> Scene:
 
     precision = [f"numerics.precision={options.precision}"] if options.precision else []
     return load(options.scene, [*options.set, *precision])
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from warpflag import figures
+
+    names = [Path(directory).resolve().name for directory in options.directories]
+    labels = names if len(set(names)) == len(names) else options.directories
+    runs = [figures.read(directory, label) for directory, label in zip(options.directories, labels, strict=True)]
+    comparison = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
+    figures.save(figures.comparison(runs) if comparison else figures.time_series(runs), options.output)
+    print(options.output)
+    return DONE
 
 
 def _export(options: argparse.Namespace) -> int:

@@ -141,10 +141,11 @@ class Record:
             # Without a lock, or a run that is still writing would keep its readers out.
             file = h5py.File(self.path, "r", locking=False)
         except OSError as error:
-            try:
-                file = h5py.File(self.path, "r")  # a file that this very process writes must be opened alike
-            except OSError:
+            # A file that this very process writes must be opened as it was, locked. Any other must not: the lock would
+            # keep its writer from opening it.
+            if "locking" not in str(error):
                 raise RecordError(f"{self.path}: not a readable HDF5 file: {one_line(error)}") from error
+            file = h5py.File(self.path, "r")
         missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
         if missing:
             file.close()

@@ -180,11 +180,11 @@ class _Film:
         """Places cells, camera and lights, once all samples have passed."""
         from pxr import Gf
 
-        places, box = arranged([extent.box for extent in self._extents])
+        places, reach = arranged([extent.reach for extent in self._extents])
         if len(self._cells) > 1:
             for cell, place in zip(self._cells, places, strict=True):
                 cell.xform.AddTranslateOp().Set(Gf.Vec3d(*(place @ self._view).tolist()))
-        add_camera(self.stage, self._view, box, self._path if self._shot.follow else None)
+        add_camera(self.stage, self._view, reach, self._path if self._shot.follow else None)
         add_lights(self.stage, self._view)
         self.stage.GetRootLayer().customLayerData = {"warpflag": self._provenance()}
 

@@ -146,16 +146,52 @@ def _kernels(p: Precision) -> SimpleNamespace:
         director = turn(transport(base_director, base_tangent, tangent), tangent, chart.increment[e][3])
         director = perpendicular_unit(director, tangent)
         state.director[e] = director
-        if chart.commit[c] != 0:
-            if e == first:
-                # The motor's turn in this step, seen from the body.
-                old = wp.quat_rotate_inv(chart.base_body_orientation[c], wp.vec3d(chart.base_director[e]))
-                new = wp.quat_rotate_inv(state.body_orientation[c], wp.vec3d(director))
-                axis = wp.vec3d(model.motor_axis[k])
-                chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
-            chart.base_position[e] = state.position[e]
-            chart.base_tangent[e] = tangent
-            chart.base_director[e] = director
+
+    @wp.kernel(module=module)
+    def commit_elements(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        chart: Chart,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        director = state.director[e]
+        if e == model.first_node[k]:
+            # The motor's turn in this step, seen from the body.
+            old = wp.quat_rotate_inv(chart.base_body_orientation[c], wp.vec3d(chart.base_director[e]))
+            new = wp.quat_rotate_inv(state.body_orientation[c], wp.vec3d(director))
+            axis = wp.vec3d(model.motor_axis[k])
+            chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
+        chart.base_position[e] = state.position[e]
+        chart.base_tangent[e] = state.tangent[e]
+        chart.base_director[e] = director
+
+    @wp.kernel(module=module)
+    def commit_bodies(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        chart: Chart,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        # Turn of the body in this step: twice the angle of the relative quaternion's part along the axis.
+        turn_of_body = state.body_orientation[c] * wp.quat_inverse(chart.base_body_orientation[c])
+        vector = wp.vec3d(turn_of_body[0], turn_of_body[1], turn_of_body[2])
+        along = wp.dot(vector, wp.vec3d(state.body_axis[c]))
+        chart.body_angle[c] += wp.float64(2.0) * wp.atan2(along, turn_of_body[3])
+        chart.base_body_position[c] = state.body_position[c]
+        chart.base_body_orientation[c] = state.body_orientation[c]
+        chart.body_increment[c] = vec6d(wp.float64(0.0))
 
     @wp.kernel(module=module)
     def fit_spin(
@@ -233,12 +269,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         b = chart.body_increment[c]
         w = wp.vec3d(b[3], b[4], b[5])
-        if chart.commit[c] != 0:
-            chart.body_angle[c] += wp.dot(w, wp.vec3d(state.body_axis[c]))
-            chart.base_body_position[c] = state.body_position[c]
-            chart.base_body_orientation[c] = state.body_orientation[c]
-            chart.body_increment[c] = vec6d(wp.float64(0.0))
-            w = wp.vec3d(wp.float64(0.0))
         v = wp.vec3d(state.body_velocity[c])
         omega = wp.vec3d(state.body_spin[c])
         # Rate of the rotation vector: inverse of the exponential's differential.
@@ -256,6 +286,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         place_flagella=place_flagella,
         place_nodes=place_nodes,
         place_frames=place_frames,
+        commit_elements=commit_elements,
+        commit_bodies=commit_bodies,
         fit_spin=fit_spin,
         rates=rates,
         body_rates=body_rates,
@@ -263,13 +295,21 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def place(model: DeviceModel, state: DeviceState, chart: Any) -> None:
-    """State from the chart's increments; where `commit` is set it becomes the start of the next step."""
+    """State from the chart's increments."""
     kernels = _kernels(model.precision)
     inputs = [model.data, chart, state.data]
     wp.launch(kernels.place_bodies, model.cell_count, inputs=inputs, device=model.device)
     wp.launch(kernels.place_flagella, model.flagellum_count, inputs=inputs, device=model.device)
     wp.launch(kernels.place_nodes, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.place_frames, model.element_count, inputs=inputs, device=model.device)
+
+
+def commit(model: DeviceModel, state: DeviceState, chart: Any) -> None:
+    """The placed state becomes the start of the next step, in cells where `commit` is set."""
+    kernels = _kernels(model.precision)
+    inputs = [model.data, state.data, chart]
+    wp.launch(kernels.commit_elements, model.element_count, inputs=inputs, device=model.device)
+    wp.launch(kernels.commit_bodies, model.cell_count, inputs=inputs, device=model.device)
 
 
 def fit_flagellum_spin(model: DeviceModel, state: DeviceState, chart: Any) -> None:

@@ -16,18 +16,12 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, response
+from warpflag_kernels import banded, chain, contacts, response, step_control
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.control import NO_FAULT, Control
 from warpflag_kernels.guard import Fault, encode
+from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
-
-LARGEST_GROWTH = 1.9  # of the step from one to the next; BDF2 is stable below 1 + sqrt(2)
-REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
-SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
-MEMORY = 5.0e-4  # of that mean [s]
-ROUND_OFF = {"float64": 1.0e-14, "float32": 5.0e-6}  # of an error estimate [um]
-SMALLEST_STEP = 1.0e-13  # [s]; a step that fails here ends the cell's run
 
 
 @functools.cache
@@ -37,20 +31,14 @@ def struct(p: Precision) -> Any:
 
     @wp.struct
     class Implicit:
-        tolerance: wp.array(dtype=wp.float64)  # error per simulated time [um/s]; 0: fixed step
         over_implicit: wp.array(dtype=wp.float64)
-        wanted_step: wp.array(dtype=wp.float64)  # [s]
         last_step: wp.array(dtype=wp.float64)  # [s]
         step_before: wp.array(dtype=wp.float64)  # [s]
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
         error: wp.array(dtype=real)  # [K], largest node error estimate [um]
-        error_sum: wp.array(dtype=wp.float64)  # fading sum of dt log(error/dt^3)
-        error_time: wp.array(dtype=wp.float64)  # fading sum of dt [s]
         accepted: wp.array(dtype=wp.int32)
-        rejected: wp.array(dtype=wp.int32)  # steps taken again so far
-        retries: wp.array(dtype=wp.int32)  # of the present step, for its error estimate
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
     return Implicit
@@ -64,20 +52,18 @@ def kernels(p: Precision) -> SimpleNamespace:
     Band, Contacts = banded.types(p).Band, contacts.struct(p)
     Response = response.types(p).Response
     _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
+    f = step_control.functions(p)
+    accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("implicit")
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
-    refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
-    round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
-    tiny = wp.constant(wp.float64(1.0e-12))
-    memory = wp.constant(wp.float64(MEMORY))
-    growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
 
     @wp.kernel(module=module)
     def begin(
         # State:
         state: State,
         control: Control,
+        steps: StepControl,
         # Out:
         imp: Implicit,
         band: Band,
@@ -89,11 +75,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             return
         one = wp.float64(1.0)
         left = control.target[c] - control.time[c]
-        dt = wp.min(imp.wanted_step[c], control.longest_step[c])
-        if dt > left * wp.float64(0.999999):
-            dt = left
-        elif dt > wp.float64(0.5) * left:
-            dt = wp.float64(0.5) * left
+        dt = next_step(steps, c, control.longest_step[c], left)
         w = wp.float64(0.0)
         if imp.history[c] > 0:
             w = dt / imp.last_step[c]
@@ -217,12 +199,12 @@ def kernels(p: Precision) -> SimpleNamespace:
         # Out:
         chart: Chart,
         control: Control,
+        steps: StepControl,
         imp: Implicit,
     ):
         c = wp.tid()
         if state.active[c] == 0:
             return
-        one = wp.float64(1.0)
         dt = control.step[c]
         error = wp.float64(0.0)
         k = model.first_flagellum[c]
@@ -231,30 +213,8 @@ def kernels(p: Precision) -> SimpleNamespace:
             k += 1
         sound = band.singular[c] == 0 and response_in.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
-        factor = growth
-        good = sound
-        tolerance = imp.tolerance[c]
-        if tolerance > wp.float64(0.0):
-            # Errors go as dt^3. A contact that opens or closes makes single estimates jump, though what adds up over
-            # time is the level between the jumps: hence the mean of the logarithm.
-            rate = error / dt
-            # A jump of the velocity keeps its rate however short the step: three times are enough.
-            good = sound and (rate < refused * tolerance or imp.retries[c] == 3)
-            if good and imp.history[c] == 2:
-                fade = wp.exp(-dt / memory)
-                level = wp.log(wp.max(error - round_off, tiny * dt) / (dt * dt * dt))
-                imp.error_sum[c] = fade * imp.error_sum[c] + level * dt
-                imp.error_time[c] = fade * imp.error_time[c] + dt
-                level = wp.exp(imp.error_sum[c] / imp.error_time[c])
-                factor = wp.min(growth, wp.sqrt(safety * tolerance / level) / dt)
-                # A steady step is more accurate than one that follows every fluctuation.
-                if factor > wp.float64(0.8) and factor < wp.float64(1.25):
-                    factor = one
-        if good:
+        if accept(steps, c, dt, error, sound, imp.history[c] == 2):
             imp.accepted[c] = 1
-            imp.retries[c] = 0
-            # A step cut short to end on a target says nothing against the longer one wanted before.
-            imp.wanted_step[c] = wp.min(growth * dt, wp.max(factor * dt, wp.min(factor, one) * imp.wanted_step[c]))
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)
@@ -266,20 +226,13 @@ def kernels(p: Precision) -> SimpleNamespace:
             return
         imp.accepted[c] = 0
         chart.commit[c] = 0
-        imp.rejected[c] += 1
-        imp.wanted_step[c] = wp.float64(0.5) * dt
-        if sound:
-            imp.retries[c] += 1
-        else:
-            imp.wanted_step[c] = wp.float64(0.25) * dt
-            if dt <= smallest:
-                if control.fault[c] == no_fault:
-                    control.fault[c] = unsolved
-            else:
-                control.fault[c] = no_fault
+        if dt > smallest:
+            control.fault[c] = no_fault
+        elif control.fault[c] == no_fault:
+            control.fault[c] = unsolved
 
     @wp.kernel(module=module)
-    def commit_elements(
+    def keep_elements(
         # Model:
         model: Model,
         # State:
@@ -288,7 +241,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         next_last: Increment,
         next_before: Increment,
         # Out:
-        chart: Chart,
         last: Increment,
         before: Increment,
     ):
@@ -296,29 +248,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0 or imp.accepted[c] == 0:
             return
-        k = model.flagellum_of[e]
-        director = state.director[e]
-        if e == model.first_node[k]:
-            # The motor's turn in this step, seen from the body.
-            old = wp.quat_rotate_inv(chart.base_body_orientation[c], wp.vec3d(chart.base_director[e]))
-            new = wp.quat_rotate_inv(state.body_orientation[c], wp.vec3d(director))
-            axis = wp.vec3d(model.motor_axis[k])
-            chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
-        chart.base_position[e] = state.position[e]
-        chart.base_tangent[e] = state.tangent[e]
-        chart.base_director[e] = director
         last.node[e] = next_last.node[e]
         before.node[e] = next_before.node[e]
 
     @wp.kernel(module=module)
-    def commit_bodies(
+    def keep_bodies(
         # State:
         state: State,
         next_last: Increment,
         next_before: Increment,
-        # Out:
         imp: Implicit,
-        chart: Chart,
+        # Out:
         last: Increment,
         before: Increment,
         control: Control,
@@ -327,11 +267,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         if imp.accepted[c] != 0:
-            b = next_last.body[c]
-            chart.body_angle[c] += wp.float64(wp.dot(vec3(b[3], b[4], b[5]), state.body_axis[c]))
-            chart.base_body_position[c] = state.body_position[c]
-            chart.base_body_orientation[c] = state.body_orientation[c]
-            last.body[c] = b
+            last.body[c] = next_last.body[c]
             before.body[c] = next_before.body[c]
         if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
             state.active[c] = 0
@@ -343,6 +279,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         add_increments=add_increments,
         estimate_error=estimate_error,
         decide=decide,
-        commit_elements=commit_elements,
-        commit_bodies=commit_bodies,
+        keep_elements=keep_elements,
+        keep_bodies=keep_bodies,
     )

@@ -23,6 +23,9 @@ SHADOW_CELL = 4
 
 _MODULE = wp.get_module("warpflag_kernels.raycast")
 _MODULE.options.update({"enable_backward": False, "cpu_compiler_flags": "-march=native", "fast_math": False})
+_SampleRays = wp.types.matrix((LIGHT_SAMPLES, 3), wp.float32)
+_SampleDistances = wp.types.vector(LIGHT_SAMPLES, wp.float32)
+_SampleHits = wp.types.vector(LIGHT_SAMPLES, wp.int32)
 _FAR = wp.constant(1.0e9)
 _OUTWARD = wp.constant(2.0e-3)  # um, from a surface to where its shadow ray starts
 
@@ -31,7 +34,7 @@ _OUTWARD = wp.constant(2.0e-3)  # um, from a surface to where its shadow ray sta
 class Capsules:
     """Rods with round ends, [N] each; linear RGB at both ends."""
 
-    bvh: wp.uint64  # over their bounds
+    bvh: wp.uint64  # over their bounds, each wider by a pixel of the picture
     start: wp.array(dtype=wp.vec3)  # [um]
     end: wp.array(dtype=wp.vec3)  # [um]
     radius: wp.array(dtype=wp.float32)  # [um]
@@ -100,19 +103,10 @@ def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec
 
 
 @wp.func
-def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3, guess: wp.int32):
-    """Distance to the first capsule on a ray and its index, or _FAR and -1.
-
-    guess: a capsule that is probably hit, which saves looking behind it; or -1.
-    """
+def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
+    """Distance to the first capsule on a ray and its index, or _FAR and -1."""
     nearest = _FAR
     hit = int(-1)
-    if guess >= 0:
-        nearest = capsule_hit(
-            origin, direction, capsules.start[guess], capsules.end[guess], capsules.radius[guess]
-        )
-        if nearest < _FAR:
-            hit = guess
     index = int(0)
     query = wp.bvh_query_ray(capsules.bvh, origin, direction)
     while wp.bvh_query_next(query, index, nearest):
@@ -203,7 +197,7 @@ def _find(
     pixel = wp.tid()
     x = float(pixel % view.width) + 0.5
     y = float(pixel // view.width) + 0.5
-    _distance, hit = nearest_hit(capsules, view.eye, ray_through(view, x, y), -1)
+    _distance, hit = nearest_hit(capsules, view.eye, ray_through(view, x, y))
     hit_out[pixel] = hit
 
 
@@ -272,23 +266,39 @@ def _paint(
         side = SAMPLES_INSIDE
     if empty:
         side = 0
-    color = wp.vec3(0.0)
-    k = int(0)
-    while k < side * side:
+    rays = _SampleRays()
+    nearest = _SampleDistances(_FAR)
+    hits = _SampleHits(-1)
+    count = side * side
+    for k in range(count):
         x = float(column) + (float(k % side) + 0.5) / float(side)
         y = float(row) + (float(k // side) + 0.5) / float(side)
-        ray = ray_through(view, x, y)
-        distance, index = nearest_hit(capsules, view.eye, ray, own)
-        if index < 0:
+        rays[k] = ray_through(view, x, y)
+    # One walk through the tree for all of them: its boxes are wider by a pixel.
+    if not empty:
+        index = int(0)
+        farthest = float(_FAR)
+        query = wp.bvh_query_ray(capsules.bvh, view.eye, ray_through(view, float(column) + 0.5, float(row) + 0.5))
+        while wp.bvh_query_next(query, index, farthest):
+            start, end, radius = capsules.start[index], capsules.end[index], capsules.radius[index]
+            farthest = float(0.0)
+            for k in range(count):
+                t = capsule_hit(view.eye, rays[k], start, end, radius)
+                if t > 0.0 and t < nearest[k]:
+                    nearest[k] = t
+                    hits[k] = index
+                farthest = wp.max(farthest, nearest[k])
+    color = wp.vec3(0.0)
+    for k in range(count):
+        if hits[k] < 0:
             color += screen
         else:
-            light = view.lights[k * LIGHT_SAMPLES // (side * side)]
-            color += surface_color(capsules, view, index, view.eye + distance * ray, ray, light)
-        k += 1
+            light = view.lights[k * LIGHT_SAMPLES // count]
+            color += surface_color(capsules, view, hits[k], view.eye + nearest[k] * rays[k], rays[k], light)
     if empty:
         color = screen
     else:
-        color /= float(side * side)
+        color /= float(count)
     for channel in range(3):
         picture_out[3 * pixel + channel] = encoded(color[channel])
 

@@ -19,8 +19,10 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels import chart as chart_stage
+from warpflag_kernels import step_control
 from warpflag_kernels.chart import vec6d
 from warpflag_kernels.control import NO_FAULT, STEP_TOLERANCE, Control
+from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 DAMPING = 2.0 / 13.0
@@ -36,7 +38,7 @@ MOST_STAGES = 1.0e4
 @functools.cache
 def struct(p: Precision) -> Any:
     """The struct `Rkc`: earlier stages and the clockwork of every cell."""
-    vec4 = p.vec4
+    real, vec4 = p.real, p.vec4
 
     @wp.struct
     class Rkc:
@@ -52,6 +54,7 @@ def struct(p: Precision) -> Any:
         probes_left: wp.array(dtype=wp.int32)  # [C], before the next step starts
         probe_norm: wp.array(dtype=wp.float64)  # [C]
         probe_sum: wp.array(dtype=wp.float64)  # [K], squared norm of the flagellum's part
+        error: wp.array(dtype=real)  # [K], largest node error estimate [um]
         spectral_radius: wp.array(dtype=wp.float64)  # [C] [1/s]
         coefficients: wp.array(dtype=wp.vec4d)  # [C]: mu, nu, and m dt, g dt [s]
         evaluations: wp.array(dtype=wp.int32)  # [C], right-hand sides so far
@@ -64,6 +67,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
+    f = step_control.functions(p)
+    accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
@@ -95,6 +100,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         # State:
         state: State,
         control: Control,
+        steps: StepControl,
         rkc: Rkc,
         # Out:
         chart: Chart,
@@ -107,8 +113,11 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         j = rkc.stage[c]
         if j == 1:
             left = control.target[c] - control.time[c]
-            count = wp.max(wp.ceil(left / control.longest_step[c] - tolerance), one)
-            control.step[c] = left / count
+            if steps.tolerance[c] > zero:
+                control.step[c] = next_step(steps, c, control.longest_step[c], left)
+            else:
+                count = wp.max(wp.ceil(left / control.longest_step[c] - tolerance), one)
+                control.step[c] = left / count
             if wp.static(euler):
                 rkc.stages[c] = 1
             else:
@@ -202,6 +211,58 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         chart.increment[e] = y
 
     @wp.kernel(module=module)
+    def estimate_error(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        control: Control,
+        chart: Chart,
+        # Out:
+        rkc: Rkc,
+    ):
+        k = wp.tid()
+        e = model.first_node[k]
+        c = model.cell_of[e]
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        # The embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step; a tenth of it,
+        # since it exceeds the errors found in runs ten to fifty times.
+        dt = real(control.step[c])
+        worst = real(0.0)
+        while e < model.first_node[k + 1]:
+            d = real(0.04) * dt * (rkc.start_rate[e] + chart.rate[e]) - real(0.08) * chart.increment[e]
+            worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+            e += 1
+        rkc.error[k] = worst
+
+    @wp.kernel(module=module)
+    def decide(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        rkc: Rkc,
+        # Out:
+        control: Control,
+        steps: StepControl,
+        chart: Chart,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        error = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            error = wp.max(error, wp.float64(rkc.error[k]))
+            k += 1
+        sound = control.fault[c] == no_fault and wp.isfinite(error)
+        if not accept(steps, c, control.step[c], error, sound, True) and control.step[c] > smallest:
+            control.fault[c] = no_fault
+            chart.commit[c] = 0
+            chart.rest[c] = 0
+
+    @wp.kernel(module=module)
     def keep(
         # Model:
         model: Model,
@@ -276,19 +337,39 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             if rkc.probes_left[c] <= 0:
                 rkc.probes_left[c] = 1
                 rkc.stage[c] = 1
+        elif j == rkc.stages[c]:
+            rkc.stage[c] = 1  # refused: again, shorter, from the same F_0
         else:
             rkc.stage[c] = j + 1
 
-    return SimpleNamespace(schedule=schedule, combine=combine, keep=keep, turn_over=turn_over)
+    return SimpleNamespace(
+        schedule=schedule,
+        combine=combine,
+        estimate_error=estimate_error,
+        decide=decide,
+        keep=keep,
+        turn_over=turn_over,
+    )
 
 
-def begin_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
+def begin_pass(
+    model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any, euler: bool
+) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
-    inputs = [model.data, state.data, control, rkc, chart]
+    inputs = [model.data, state.data, control, steps, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
+
+
+def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
+    """Estimates the error of every completed step and takes back `commit` where the step is refused."""
+    kernels = _kernels(model.precision, False)
+    inputs = [model.data, state.data, control, chart, rkc]
+    wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
+    inputs = [model.data, state.data, rkc, control, steps, chart]
+    wp.launch(kernels.decide, model.cell_count, inputs=inputs, device=model.device)
 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:

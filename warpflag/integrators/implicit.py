@@ -8,9 +8,15 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import banded, chain, contacts, control, correction, guard, hessian, implicit, response
+from warpflag_kernels import banded, chain, chart, contacts, control, correction, guard, hessian, implicit, response
 
-from warpflag.integrators.stepper import System
+from warpflag.integrators.stepper import (
+    DEFAULT_ACCURACY,
+    STEP_MEMORY,
+    System,
+    build_step_control,
+    restart_step_control,
+)
 from warpflag.scene import Scene
 from warpflag.stages import launch_right_hand_side
 
@@ -18,12 +24,8 @@ __all__ = ["ImplicitStepper"]
 
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
-DEFAULT_ACCURACY = 5.0e-3
-"""Node error per simulated time that `numerics.accuracy` asks for when it is absent [um/ms]."""
 SWEEPS = 1
 """Defect corrections per step for the flows that stay outside the matrix."""
-FIRST_STEP = 1.0e-8
-"""First step after a start, when nothing is known of the motion yet [s]."""
 
 
 class ImplicitStepper:
@@ -88,16 +90,15 @@ class ImplicitStepper:
         self._contacts, self._response, self._groups = self._contact_arrays()
 
         i = implicit.struct(p)()
-        i.tolerance, i.over_implicit, i.wanted_step = (zeros(cells, wp.float64) for _ in range(3))
+        i.over_implicit = zeros(cells, wp.float64)
         i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
-        i.error_sum, i.error_time = zeros(cells, wp.float64), zeros(cells, wp.float64)
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
-        i.history, i.accepted, i.rejected, i.retries, i.evaluations = (zeros(cells, wp.int32) for _ in range(5))
+        i.history, i.accepted, i.evaluations = (zeros(cells, wp.int32) for _ in range(3))
         i.error = zeros(flagella, p.real)
         self.data = i
         fixed = [scene.numerics.time_step for scene in scenes]
-        accuracy = [scene.numerics.accuracy or DEFAULT_ACCURACY for scene in scenes]
-        i.tolerance.assign([0.0 if f else a * 1e3 for f, a in zip(fixed, accuracy, strict=True)])
+        accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
+        self.steps = build_step_control(accuracies, device)
         # The flows that stay outside the matrix grow with the number of flagella.
         i.over_implicit.assign([1.3 if len(s.resolved_flagella()) < 3 else 2.0 for s in scenes])
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
@@ -109,7 +110,9 @@ class ImplicitStepper:
         model, state, device = s.model, s.state, s.model.device
         k = implicit.kernels(model.precision)
         touching = self._contacts, self._response
-        wp.launch(k.begin, model.cell_count, inputs=[state.data, s.control, i, band, *touching], device=device)
+        wp.launch(
+            k.begin, model.cell_count, inputs=[state.data, s.control, self.steps, i, band, *touching], device=device
+        )
         carry = (self._last, self._before, self._carried, self._carried_before)
         chain.retract(model, state, self._base, i.ratio, self._last, self._now, carry)
         launch_right_hand_side(self._free, state)
@@ -140,46 +143,36 @@ class ImplicitStepper:
         carry = (self._total, self._carried, self._next_last, self._next_before)
         chain.retract(model, state, self._now, i.one, x, self._now, carry)
         guard.check(model, state, s.chart, s.guard, s.control)
-        inputs = [model.data, state.data, band, *touching, s.chart, s.control, i]
+        inputs = [model.data, state.data, band, *touching, s.chart, s.control, self.steps, i]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
         moved = [self._next_last, self._next_before]
-        inputs = [model.data, state.data, i, *moved, s.chart, self._last, self._before]
-        wp.launch(k.commit_elements, model.element_count, inputs=inputs, device=device)
+        inputs = [model.data, state.data, i, *moved, self._last, self._before]
+        wp.launch(k.keep_elements, model.element_count, inputs=inputs, device=device)
+        chart.commit(model, state, s.chart)
         guard.remember(model, state, s.chart, s.guard, s.control)
-        inputs = [state.data, *moved, i, s.chart, self._last, self._before, s.control]
-        wp.launch(k.commit_bodies, model.cell_count, inputs=inputs, device=device)
+        inputs = [state.data, *moved, i, self._last, self._before, s.control]
+        wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         control.count_pass(s.control, device)
 
     def restart(self) -> None:
         self.data.history.zero_()
-        self.data.error_sum.zero_()
-        self.data.error_time.zero_()
-        longest = self._system.control.longest_step.numpy()
-        controlled = self.data.tolerance.numpy() > 0.0
-        self.data.wanted_step.assign(np.where(controlled, FIRST_STEP, longest / 64))
+        restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = (
-            "wanted_step",
-            "last_step",
-            "step_before",
-            "error_sum",
-            "error_time",
-            "history",
-            "rejected",
-            "evaluations",
-        )
+        names = ("last_step", "step_before", "history", "evaluations")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
+        kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
         for name, x in (("last", self._last), ("before", self._before)):
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
-        for name, x in (("last", self._last), ("before", self._before)):
-            x.node.assign(memory.pop(f"{name}_node"))
-            x.body.assign(memory.pop(f"{name}_body"))
         for name, values in memory.items():
-            getattr(self.data, name).assign(values)
+            whose, _, part = name.partition("_")
+            if part in ("node", "body"):
+                getattr(self._last if whose == "last" else self._before, part).assign(values)
+            else:
+                getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
 
     def _contact_arrays(self) -> tuple[Any, Any, int]:
         """Lists and matrices of contacts: room for three per node of a cell (eight bundled flagella need two)."""

@@ -10,7 +10,7 @@ import warp as wp
 from warpflag_kernels import chart, control, guard, rkc
 
 from warpflag.drag import filament_mobility
-from warpflag.integrators.stepper import System
+from warpflag.integrators.stepper import STEP_MEMORY, System, build_step_control, restart_step_control
 from warpflag.scene import Scene
 from warpflag.stages import launch_right_hand_side
 
@@ -18,6 +18,8 @@ __all__ = ["EULER_STEPS_PER_CHECK", "RKC_STEP", "RkcStepper", "euler_step"]
 
 RKC_STEP = 1.0e-5
 """Default step of RKC [s]: node errors of about 1e-3 um after 1 ms of the zipping scene."""
+LONGEST_STEP = 1.0e-4
+"""Longest step of RKC under accuracy control [s]."""
 EULER_STEPS_PER_CHECK = 100
 
 
@@ -61,16 +63,22 @@ class RkcStepper:
         r.evaluations = zeros(cells, wp.int32)
         r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
         r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
+        r.error = zeros(flagella, p.real)
         self.data = r
-        steps = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
-        system.control.longest_step.assign(np.array(steps))
+        fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
+        accuracies = [0.0 if f else s.numerics.accuracy for f, s in zip(fixed, scenes, strict=True)]
+        self.steps = build_step_control(accuracies, device)
+        longest = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
+        longest = [step if f else LONGEST_STEP for f, step in zip(fixed, longest, strict=True)]
+        system.control.longest_step.assign(longest)
         system.guard.interval.fill_(EULER_STEPS_PER_CHECK if euler else 1)
+        self._controlled = any(accuracies)
         self._seed_probe()
         self.restart()
 
     def launch_pass(self) -> None:
         s = self._system
-        rkc.begin_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
+        rkc.begin_pass(s.model, s.state, s.chart, s.control, self.steps, self.data, self._euler)
         chart.place(s.model, s.state, s.chart)
         launch_right_hand_side(s.model, s.state)
         # Most passes are stages inside a step: what happens between steps is not even launched there.
@@ -82,11 +90,16 @@ class RkcStepper:
     def _launch_between_steps(self) -> None:
         s = self._system
         guard.check(s.model, s.state, s.chart, s.guard, s.control)
+        if not self._euler and self._controlled:
+            chart.increment_rates(s.model, s.state, s.chart)
+            rkc.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
+        chart.commit(s.model, s.state, s.chart)
         guard.remember(s.model, s.state, s.chart, s.guard, s.control)
         if not self._euler:
             chart.fit_flagellum_spin(s.model, s.state, s.chart)
 
     def restart(self) -> None:
+        restart_step_control(self.steps, np.zeros(len(self.steps.tolerance)))
         self.data.stage.fill_(-1)
         self.data.stages.fill_(1)
         self.data.probes_left.fill_(rkc.FIRST_PROBES)
@@ -94,11 +107,12 @@ class RkcStepper:
     def memory(self) -> dict[str, np.ndarray]:
         names = ("stage", "start_rate", "body_start_rate", "evaluations")
         names += ("probe", "probe_norm", "probes_left", "spectral_radius")
-        return {name: getattr(self.data, name).numpy().copy() for name in names}
+        kept = {name: getattr(self.data, name).numpy().copy() for name in names}
+        return kept | {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         for name, values in memory.items():
-            getattr(self.data, name).assign(values)
+            getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
 
     def _seed_probe(self) -> None:
         """A direction with a share of every mode: random, but the same in every run and every cell."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import warp as wp
+from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import DeviceModel, DeviceState
 
-__all__ = ["Stepper", "System"]
+__all__ = ["DEFAULT_ACCURACY", "STEP_MEMORY", "Stepper", "System", "build_step_control", "restart_step_control"]
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,37 @@ class System:
     chart: Any
     control: Any
     guard: Any
+
+
+DEFAULT_ACCURACY = 5.0e-3
+"""Node error per simulated time that step control keeps when `numerics.accuracy` is absent [um/ms]."""
+FIRST_STEP = 1.0e-8
+"""First step under control after a start, when nothing is known of the motion yet [s]."""
+
+
+def build_step_control(accuracies: Sequence[float], device: Any) -> StepControl:
+    """Step control of every cell.
+
+    Args:
+        accuracies: node error per simulated time [um/ms]; 0 for a fixed step.
+    """
+    cells = len(accuracies)
+    c = StepControl()
+    c.tolerance = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
+    c.wanted_step, c.error_sum, c.error_time = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(3))
+    c.rejected, c.retries = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+    return c
+
+
+def restart_step_control(c: StepControl, fixed_start: np.ndarray) -> None:
+    """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
+    c.error_sum.zero_()
+    c.error_time.zero_()
+    c.retries.zero_()
+    c.wanted_step.assign(np.where(c.tolerance.numpy() > 0.0, FIRST_STEP, fixed_start))
+
+
+STEP_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")
 
 
 class Stepper(Protocol):

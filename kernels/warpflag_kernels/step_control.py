@@ -1,0 +1,93 @@
+"""Step control on the device: from an error estimate per step to the next step, per cell, one rule for every stepper.
+
+The estimate of a second-order step goes as dt^3. A contact that opens or closes makes single estimates jump, though
+what adds up over time is the level between the jumps: hence the control follows the fading mean of log(error/dt^3)
+and keeps the step while that mean asks for less than a fifth of change. A step that follows every fluctuation is less
+accurate at the same cost.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.types import Precision
+
+LARGEST_GROWTH = 1.9  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
+REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
+SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
+MEMORY = 5.0e-4  # of that mean [s]
+MOST_RETRIES = 3  # for an estimate: a jump of the velocity keeps its rate however short the step
+ROUND_OFF = {"float64": 1.0e-14, "float32": 5.0e-6}  # of an error estimate [um]
+SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be taken here ends the cell's run
+
+
+@wp.struct
+class StepControl:
+    """Per cell [C]."""
+
+    tolerance: wp.array(dtype=wp.float64)  # error per simulated time [um/s]; 0: fixed step
+    wanted_step: wp.array(dtype=wp.float64)  # [s]
+    error_sum: wp.array(dtype=wp.float64)  # fading sum of dt log(error/dt^3)
+    error_time: wp.array(dtype=wp.float64)  # fading sum of dt [s]
+    rejected: wp.array(dtype=wp.int32)  # steps taken again so far
+    retries: wp.array(dtype=wp.int32)  # of the present step, for its estimate
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions of one precision."""
+    module = p.module("step_control")
+    growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
+    refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
+    round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
+    tiny, most_retries = wp.constant(wp.float64(1.0e-12)), wp.constant(wp.int32(MOST_RETRIES))
+
+    @wp.func(module=module)
+    def accept(control: StepControl, c: wp.int32, dt: wp.float64, error: wp.float64, sound: wp.bool, known: wp.bool):
+        """Whether a step counts; sets the next one.
+
+        Args:
+            error: estimate of this step [um]; `known` says whether there is one.
+            sound: the step was solved and violates no guard.
+        """
+        one = wp.float64(1.0)
+        factor = growth
+        good = sound
+        tolerance = control.tolerance[c]
+        if tolerance > wp.float64(0.0) and known:
+            good = sound and (error < refused * tolerance * dt or control.retries[c] == most_retries)
+            if good:
+                fade = wp.exp(-dt / memory)
+                level = wp.log(wp.max(error - round_off, tiny * dt) / (dt * dt * dt))
+                control.error_sum[c] = fade * control.error_sum[c] + level * dt
+                control.error_time[c] = fade * control.error_time[c] + dt
+                level = wp.exp(control.error_sum[c] / control.error_time[c])
+                factor = wp.min(growth, wp.sqrt(safety * tolerance / level) / dt)
+                if factor > wp.float64(0.8) and factor < wp.float64(1.25):
+                    factor = one
+        if good:
+            control.retries[c] = 0
+            # A step cut short to end on a target says nothing against the longer one wanted before.
+            wanted = wp.max(factor * dt, wp.min(factor, one) * control.wanted_step[c])
+            control.wanted_step[c] = wp.min(growth * dt, wanted)
+            return True
+        control.rejected[c] += 1
+        control.wanted_step[c] = wp.float64(0.5) * dt
+        if sound:
+            control.retries[c] += 1
+        else:
+            control.wanted_step[c] = wp.float64(0.25) * dt
+        return False
+
+    @wp.func(module=module)
+    def next_step(control: StepControl, c: wp.int32, longest: wp.float64, left: wp.float64):
+        """The wanted step, shortened so that steps end on the target and none before it is a sliver [s]."""
+        dt = wp.min(control.wanted_step[c], longest)
+        if dt > left * wp.float64(0.999999):
+            dt = left
+        elif dt > wp.float64(0.5) * left:
+            dt = wp.float64(0.5) * left
+        return dt
+
+    return SimpleNamespace(accept=accept, next_step=next_step, smallest=smallest)

@@ -1,0 +1,56 @@
+"""Short runs for the tests of the driver, and what they have recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warpflag import run
+from warpflag.record import Record
+from warpflag.scene import Scene, with_values
+from warpflag.simulation import Simulation
+
+
+def small(values=None) -> Scene:
+    """Two short flagella, eight frames."""
+    return with_values(Scene(name="small"), {"duration": 8e-5, "frames": 8, "flagella.length": 2.0, **(values or {})})
+
+
+def executed(scene: Scene, directory: Path) -> Path:
+    outcome = run.start(scene, str(directory), "cpu").execute(quiet=True)
+    assert outcome.status == "done", outcome.message
+    return directory
+
+
+def summary(directory: Path) -> dict:
+    return json.loads((directory / "summary.json").read_text())
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, frame: int) -> None:
+    """Ctrl-C while the steps toward a frame are taken."""
+    advance = Simulation.advance
+
+    def interrupted(self, until, watch=None):
+        advance(self, until, watch)
+        if round(until / self.scenes[0].duration * self.scenes[0].frames) == frame:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Simulation, "advance", interrupted)
+
+
+def arrays(directory: Path) -> dict[str, np.ndarray]:
+    """Everything that is recorded of the frames."""
+    with Record(directory) as record:
+        names = ("times", "steps", "positions", "directors", "motor_angle", "body_position", "body_orientation")
+        return {name: np.asarray(getattr(record, name)) for name in names} | record.observables
+
+
+def assert_same_frames(a: Path, b: Path) -> None:
+    """To the last bit."""
+    first, second = arrays(a), arrays(b)
+    assert first.keys() == second.keys()
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, second[name], err_msg=name)

@@ -1,0 +1,154 @@
+"""What a movie colours the nodes by, from the record alone: curvature, phase difference, contact load.
+
+Functions take blocks of frames: positions [um] and directors e1, shape [frame, node, 3], flagellum after flagellum,
+and `first_node`, shape [flagellum_count + 1]. They return a value per node, shape [frame, node].
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpflag.observables import local_phase_difference, segment_tangents
+
+__all__ = ["contact_load", "curvature", "nearest_phase_difference"]
+
+Array = NDArray[np.floating]
+
+_CUTOFF = 2.0 ** (1.0 / 6.0)  # of the steric force, in units of sigma
+_LINEAR_BELOW = 0.7
+
+
+def curvature(positions: Array, first_node: NDArray[np.integer]) -> Array:
+    """Curvature of the centre line [1/um]: |kb| of discrete elastic rods over the mean length of the two segments.
+
+    The ends of a flagellum have no joint and take their neighbour's value.
+    """
+    values = np.empty(positions.shape[:2])
+    for first, end in pairwise(first_node):
+        edges = np.diff(positions[:, first:end], axis=1)
+        lengths = np.sqrt(np.vecdot(edges, edges))
+        tangents = edges / lengths[..., None]
+        before, after = tangents[:, :-1], tangents[:, 1:]
+        binormal = 2.0 * np.cross(before, after) / (1.0 + np.vecdot(before, after))[..., None]
+        joints = 2.0 * np.sqrt(np.vecdot(binormal, binormal)) / (lengths[:, :-1] + lengths[:, 1:])
+        values[:, first:end] = np.pad(joints, ((0, 0), (1, 1)), mode="edge")
+    return values
+
+
+def nearest_phase_difference(positions: Array, directors: Array, first_node: NDArray[np.integer]) -> Array:
+    """Local phase difference theta(i) in [0, 1] of each segment with the same one of the nearest other flagellum.
+
+    Nearest is the flagellum whose node of the same number is; segments are paired by their number from the motor,
+    as the paper does. Node i takes the value of segment i, r_0 that of segment 1. NaN where there is no other
+    flagellum of that length, or where the tangents are antiparallel.
+    """
+    first_node = np.asarray(first_node)
+    counts = np.diff(first_node)
+    frames = len(positions)
+    # Padded to the longest flagellum, node number first: node i meets the nodes i of all others.
+    shape = (frames, counts.max(), len(counts), 3)
+    nodes, e1, e3 = np.full(shape, np.inf), np.full(shape, np.nan), np.full(shape, np.nan)
+    for k, (first, end) in enumerate(pairwise(first_node)):
+        nodes[:, : counts[k], k] = positions[:, first:end]
+        e1[:, 1 : counts[k], k] = directors[:, first + 1 : end]
+        e3[:, 1 : counts[k], k] = segment_tangents(positions[:, first:end])
+    theta = np.full(shape[:3], np.nan)
+    for i in range(1, counts.max()):
+        present = np.flatnonzero(counts > i)
+        if len(present) < 2:
+            break
+        x = nodes[:, i, present]
+        x = x - x.mean(axis=1, keepdims=True)
+        squares = np.vecdot(x, x)
+        distances = squares[:, None, :] - 2.0 * x @ x.swapaxes(1, 2)  # less |x|^2 of the row, which ranks the same
+        distances[:, range(len(present)), range(len(present))] = np.inf
+        partner = distances.argmin(axis=2)[..., None]
+        own_e1, own_e3 = e1[:, i, present], e3[:, i, present]
+        theta[:, i, present] = local_phase_difference(
+            own_e1, own_e3, np.take_along_axis(own_e1, partner, 1), np.take_along_axis(own_e3, partner, 1)
+        )
+    theta[:, 0] = theta[:, 1]
+    return np.concatenate([theta[:, : counts[k], k] for k in range(len(counts))], axis=1)
+
+
+def contact_load(positions: Array, first_node: NDArray[np.integer], strength: float, diameter: float) -> Array:
+    """Steric load of each node [pN]: its shares of |F| from every contact between segments of different flagella.
+
+    The force of the simulation (kernels: steric): F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, along its
+    tangent below 0.7 sigma, r the least distance of two segments; at parameter t of a segment it acts by 1 - t on
+    the first and t on the second node. Every contact counts on both sides, so a frame's sum is twice the recorded
+    steric force.
+
+    strength: F_0 [pN]. diameter: sigma [um].
+    """
+    frames, nodes = positions.shape[:2]
+    is_segment = np.ones(nodes, dtype=bool)
+    is_segment[np.asarray(first_node)[:-1]] = False
+    last = np.flatnonzero(is_segment)  # segment i ends at node i
+    flagellum = np.repeat(np.arange(len(first_node) - 1), np.diff(first_node))[last]
+    starts, vectors = positions[:, last - 1], positions[:, last] - positions[:, last - 1]
+    longest = float(np.sqrt(np.vecdot(vectors, vectors).max()))
+    i, j = _near_pairs(starts + 0.5 * vectors, longest + _CUTOFF * diameter, flagellum)
+    starts, vectors = starts.reshape(-1, 3), vectors.reshape(-1, 3)
+    distance, s, t = _closest(starts[i], vectors[i], starts[j], vectors[j])
+    force = _steric_force(distance / diameter, strength)
+    node = (np.arange(frames)[:, None] * nodes + last).ravel()
+    shares = ((node[i] - 1, 1.0 - s), (node[i], s), (node[j] - 1, 1.0 - t), (node[j], t))
+    load = sum(np.bincount(where, share * force, frames * nodes) for where, share in shares)
+    return np.reshape(load, (frames, nodes))
+
+
+def _steric_force(x: Array, strength: float) -> Array:
+    """The repulsion at distance x in units of sigma [pN]."""
+    y = 1.0 / np.maximum(x, _LINEAR_BELOW)
+    force = 2.0 * y**13 - y**7 + (26.0 * y**14 - 7.0 * y**8) * np.maximum(_LINEAR_BELOW - x, 0.0)
+    return np.where(x < _CUTOFF, strength * force, 0.0)
+
+
+def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tuple[NDArray, NDArray]:
+    """Pairs of one frame's points nearer than `reach`, of different groups, each once; indices frame * count + point.
+
+    points: shape [frame, count, 3]. group: shape [count].
+
+    Points are sorted by cell of a grid of that width; z is its fastest index, so that the cells above and below
+    are one range of the sorted points, and five ranges hold every neighbour once.
+    """
+    frames, count = points.shape[:2]
+    frame = np.repeat(np.arange(frames), count)
+    points = points.reshape(-1, 3)
+    cell = ((points - points.min(axis=0)) / reach).astype(np.int64) + 1
+    nx, ny, nz = cell.max(axis=0) + 2
+    key = ((frame * nx + cell[:, 0]) * ny + cell[:, 1]) * nz + cell[:, 2]
+    order = np.argsort(key, kind="stable")
+    points, key, group = points[order], key[order], np.tile(group, frames)[order]
+    pairs = []
+    for column in (0, 1, ny - 1, ny, ny + 1):
+        centre = key + column * nz
+        begin = np.arange(1, len(key) + 1) if column == 0 else np.searchsorted(key, centre - 1)
+        counts = np.searchsorted(key, centre + 1, side="right") - begin
+        i = np.repeat(np.arange(len(key)), counts)
+        j = np.arange(len(i)) + np.repeat(begin - np.cumsum(counts) + counts, counts)
+        other = group[i] != group[j]
+        i, j = i[other], j[other]
+        away = points[i] - points[j]
+        near = np.vecdot(away, away) < reach * reach
+        pairs.append((order[i[near]], order[j[near]]))
+    return np.concatenate([i for i, _ in pairs]), np.concatenate([j for _, j in pairs])
+
+
+def _closest(p1: Array, d1: Array, p2: Array, d2: Array) -> tuple[Array, Array, Array]:
+    """Least distance of segments p1 + s d1 and p2 + t d2, and its s and t in [0, 1]; shapes [pair]."""
+    r = p1 - p2
+    a, e, b = np.vecdot(d1, d1), np.vecdot(d2, d2), np.vecdot(d1, d2)
+    c, f = np.vecdot(d1, r), np.vecdot(d2, r)
+    denominator = a * e - b * b
+    parallel = denominator <= 1e-7 * a * e
+    s = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, denominator), 0.0, 1.0))
+    t = (b * s + f) / e
+    s = np.where(t < 0.0, np.clip(-c / a, 0.0, 1.0), np.where(t > 1.0, np.clip((b - c) / a, 0.0, 1.0), s))
+    t = np.clip(t, 0.0, 1.0)
+    gap = r + s[:, None] * d1 - t[:, None] * d2
+    return np.sqrt(np.vecdot(gap, gap)), s, t

@@ -1,0 +1,79 @@
+"""How far two flagella are out of phase: the angle between their material frames, segment by segment."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpflag.observables.arrays import Array
+
+__all__ = ["local_phase_difference", "phase_difference", "segment_tangents"]
+
+_ANTIPARALLEL = 1e-12  # of 1 + cos: tangents within 1.4e-6 rad of antiparallel have no minimal rotation
+
+
+def local_phase_difference(e1_a: Array, tangents_a: Array, e1_b: Array, tangents_b: Array) -> Array:
+    """Local phase difference of two flagella, segment by segment: theta(i) = arccos(e1(i) . e1~*(i)) / pi.
+
+    e1~* is the e1 of flagellum b after the minimal rotation that takes its tangent onto the tangent of
+    flagellum a. Exchanging the flagella changes nothing. Source: the paper, text above its Fig. 3.
+
+    e1_a, e1_b: material directors e1, unit, across the tangents; shape [..., segment_count, 3], broadcast
+    together. tangents_a, tangents_b: unit tangents e3, same shapes.
+
+    Returns theta in [0, 1], shape [..., segment_count]: 0 in phase, 1 in antiphase. Where the tangents are
+    antiparallel no rotation is minimal and theta is undefined: NaN there, which the averages leave out.
+    """
+    e1_a, tangents_a = np.asarray(e1_a, float), np.asarray(tangents_a, float)
+    e1_b, tangents_b = np.asarray(e1_b, float), np.asarray(tangents_b, float)
+    tangent_sum = tangents_a + tangents_b
+    one_plus_cos = 0.5 * np.vecdot(tangent_sum, tangent_sum)  # free of the cancellation in 1 + t.t
+    one_plus_cos = np.where(one_plus_cos < _ANTIPARALLEL, np.nan, one_plus_cos)
+    # e1* = e1_b - (t_a . e1_b) / (1 + t_a . t_b) (t_a + t_b), resolved along e1_a and e2_a. The angle from
+    # atan2 is exact to round-off at 0 and pi, where arccos loses half the digits.
+    e2_a = np.cross(tangents_a, e1_a)
+    tilt = np.vecdot(tangents_a, e1_b) / one_plus_cos
+    along_e1 = np.vecdot(e1_a, e1_b) - tilt * np.vecdot(e1_a, tangents_b)
+    along_e2 = np.vecdot(e2_a, e1_b) - tilt * np.vecdot(e2_a, tangents_b)
+    return np.abs(np.arctan2(along_e2, along_e1)) / np.pi
+
+
+def segment_tangents(positions: Array) -> Array:
+    """Unit tangents of the segments 1..N of one flagellum with nodes `positions` [um], [..., N + 1, 3]."""
+    edges = np.diff(np.asarray(positions, float), axis=-2)
+    return edges / np.sqrt(np.vecdot(edges, edges))[..., None]
+
+
+def phase_difference(positions: Array, directors: Array, first_node: NDArray[np.integer]) -> float:
+    """Contour-averaged phase difference <theta> in [0, 1] of one frame, mean over all pairs of flagella.
+
+    theta(i) of `local_phase_difference` is averaged over the segments 1..N of a pair (segments are paired by
+    their number from the motor; of unequal flagella the common part counts), then over the pairs. Undefined
+    segments are left out. Source: the paper, Fig. 3(a).
+
+    positions: nodes [um], shape [node_count, 3]. directors: e1 of tripod and segments, shape [node_count, 3].
+
+    Returns NaN where no segment of any pair is defined. Raises ValueError with fewer than two flagella.
+    """
+    positions, directors = np.asarray(positions, float), np.asarray(directors, float)
+    bounds = [int(i) for i in np.asarray(first_node)]
+    if len(bounds) < 3:
+        raise ValueError("phase_difference needs at least two flagella")
+    lengths = np.diff(bounds) - 1
+    # Padded with NaN: ragged flagella broadcast, and the padding drops out with the undefined segments.
+    e1 = np.full((len(lengths), lengths.max(), 3), np.nan)
+    tangents = np.full_like(e1, np.nan)
+    for k, (first, end) in enumerate(pairwise(bounds)):
+        e1[k, : lengths[k]] = directors[first + 1 : end]
+        tangents[k, : lengths[k]] = segment_tangents(positions[first:end])
+    pair_means = []
+    for k in range(len(lengths) - 1):
+        theta = local_phase_difference(e1[k], tangents[k], e1[k + 1 :], tangents[k + 1 :])
+        defined = ~np.isnan(theta)
+        counts = np.count_nonzero(defined, axis=-1)
+        sums = np.sum(theta, axis=-1, where=defined)
+        pair_means.append(sums[counts > 0] / counts[counts > 0])
+    means = np.concatenate(pair_means)
+    return float(means.mean()) if means.size else float("nan")

@@ -1,0 +1,142 @@
+"""The shape of flagella: strains and elastic energy along the contour, axis and pitch of the helix, winding."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from warpflag.observables.arrays import Array, flagella, unit
+from warpflag.observables.phase import segment_tangents
+
+if TYPE_CHECKING:
+    from warpflag.scene import Scene
+
+__all__ = [
+    "elastic_energy",
+    "helix_axis",
+    "helix_pitch",
+    "phase_velocity",
+    "strain",
+    "turns_about_axis",
+    "winding_number",
+]
+
+
+def strain(tangents: Array, directors: Array, segment_length: float) -> Array:
+    """Curvatures and twist along one flagellum: Omega_1, Omega_2, Omega_3 of every joint [1/um], [..., count - 1, 3].
+
+    Curvature is |(Omega_1, Omega_2)|, twist Omega_3; the ground state has (0, 1.3, -2.1). Discrete elastic rods
+    (Bergou et al. 2008): with the curvature binormal kb = 2 t x u/(1 + t.u) of the tangents t, u before and after,
+    h Omega_1,2 = kb . (mean e1, mean e2), and h Omega_3 the angle from e1, carried along by the minimal rotation of t
+    onto u, to the next e1.
+
+    tangents, directors: e3 and e1 of consecutive segments, shape [..., count, 3]; with the motor tripod first, row 0 of
+    the result is the hook. segment_length: h at rest [um].
+    """
+    tangents, directors = np.asarray(tangents, float), np.asarray(directors, float)
+    t, u, a, b = tangents[..., :-1, :], tangents[..., 1:, :], directors[..., :-1, :], directors[..., 1:, :]
+    one_plus_cos = 1.0 + np.vecdot(t, u)
+    binormal = np.cross(t, u) * (2.0 / one_plus_cos)[..., None]
+    carried = a - (np.vecdot(u, a) / one_plus_cos)[..., None] * (t + u)
+    twist = np.arctan2(np.vecdot(np.cross(carried, b), u), np.vecdot(carried, b))
+    bend = [np.vecdot(binormal, a + b) / 2, np.vecdot(binormal, np.cross(t, a) + np.cross(u, b)) / 2]
+    return np.stack([*bend, twist], axis=-1) / segment_length
+
+
+def elastic_energy(
+    scene: Scene, positions: Array, directors: Array, motor_axes: Array, first_node: NDArray[np.integer]
+) -> Array:
+    """Elastic energy of all flagella by term: bending, twist (with the hook's), stretching [pN um], shape [3].
+
+    Source: the paper's Kirchhoff energy, discretised as in `strain`; the stretching energy has a rest length,
+    (K h/2)(|dr|/h - 1)^2. positions, directors: shape [node_count, 3]; motor_axes: e3 of the tripods in the lab, shape
+    [flagellum_count, 3].
+    """
+    group, energy = scene.flagella, np.zeros(3)
+    for spec, rows, axis in zip(scene.resolved_flagella(), flagella(first_node), motor_axes, strict=True):
+        h, nodes = spec.segment_length, np.asarray(positions[rows], float)
+        omega = strain(np.vstack([axis, segment_tangents(nodes)]), directors[rows], h)
+        excess = omega[1:] - group.intrinsic_curvature
+        hook = group.hook_twist_factor * omega[0, 2] ** 2
+        stretch = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / h - 1.0
+        energy += [
+            h / 2 * group.bending_rigidity * (excess[:, :2] ** 2).sum(),
+            h / 2 * group.twist_rigidity * ((excess[:, 2] ** 2).sum() + hook),
+            h / 2 * group.stretching_stiffness * stretch @ stretch,
+        ]
+    return energy
+
+
+def helix_axis(tangents: Array) -> Array:
+    """Axis of a helix from the tangents of its segments, [..., count, 3], pointing along it; shape [..., 3].
+
+    The direction to which the tangents keep the most even angle: along it their covariance is least.
+    """
+    tangents = np.asarray(tangents, float)
+    mean = tangents.mean(axis=-2, keepdims=True)
+    spread = tangents - mean
+    _, vectors = np.linalg.eigh(np.einsum("...ia,...ib->...ab", spread, spread))
+    axis = vectors[..., 0]
+    return axis * np.copysign(1.0, np.vecdot(axis, mean[..., 0, :]))[..., None]
+
+
+def helix_pitch(positions: Array) -> float:
+    """Advance along the helix axis per turn of the tangents about it [um], negative for a left-handed helix.
+
+    positions: nodes of one flagellum [um], shape [N + 1, 3]; a segment must turn by less than half a turn.
+    """
+    edges = np.diff(np.asarray(positions, float), axis=0)
+    axis = helix_axis(unit(edges))
+    # The first and last segment are half outside the turns from middle to middle.
+    rise = float((edges @ axis).sum() - (edges[0] + edges[-1]) @ axis / 2)
+    return rise / turns_about_axis(edges, [0.0, 0.0, 0.0], axis)
+
+
+def phase_velocity(pitch: float, rate: float) -> float:
+    """Speed v_e of the helical wave away from the body [um/s]: v_e = lambda_f nu_f of the paper's zipper.
+
+    pitch: with its sign, negative for a left-handed helix [um]. rate: of the rotation about the axis [Hz]; a
+    left-handed helix that turns positive sends its wave away from the body.
+    """
+    return -pitch * rate
+
+
+def winding_number(positions_a: Array, positions_b: Array) -> float:
+    """Turns that two flagella make about each other: the Gauss linking integral of their centre lines.
+
+    (1/4 pi) sum over segment pairs of the solid angle that the parallelogram of their connecting vectors
+    spans, exact for straight segments. Positive where they wind right-handed; for open curves it need not be
+    whole, and it jumps by 1 when one passes through the other. The curves must not touch.
+
+    positions_a, positions_b: nodes [um], shapes [N_a + 1, 3] and [N_b + 1, 3].
+    """
+    a, b = np.asarray(positions_a, float), np.asarray(positions_b, float)
+    vectors = a[:, None, :] - b[None, :, :]
+    p, q, r, s = vectors[:-1, :-1], vectors[1:, :-1], vectors[1:, 1:], vectors[:-1, 1:]
+    return float((_solid_angle(p, q, r) + _solid_angle(p, r, s)).sum() / (-4.0 * np.pi))
+
+
+def _solid_angle(a: Array, b: Array, c: Array) -> Array:
+    """Signed solid angle of the triangles a, b, c seen from the origin (van Oosterom & Strackee 1983)."""
+    la, lb, lc = (np.sqrt(np.vecdot(v, v)) for v in (a, b, c))
+    denominator = la * lb * lc + np.vecdot(a, b) * lc + np.vecdot(b, c) * la + np.vecdot(c, a) * lb
+    return 2.0 * np.arctan2(np.vecdot(a, np.cross(b, c)), denominator)
+
+
+def turns_about_axis(points: Array, origin: ArrayLike, axis: ArrayLike) -> float:
+    """Turns that a chain of points makes about a straight axis, right-handed about its direction positive.
+
+    Taken along a flagellum it is negative for a left-handed helix; taken along the frames of one node it
+    counts the turns of that node. Right as long as two successive points are less than half a turn apart.
+
+    points: [um], shape [count, 3]. origin: a point of the axis [um], shape [3]. axis: its direction, shape
+    [3].
+    """
+    axis = unit(axis)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    offsets = np.asarray(points, float) - np.asarray(origin, float)
+    angles = np.unwrap(np.arctan2(offsets @ np.cross(axis, across), offsets @ across))
+    return float((angles[-1] - angles[0]) / (2.0 * np.pi))
