@@ -22,9 +22,11 @@ def members(precision: str, stepper: str = "rkc") -> list[Scene]:
     return [
         cell(common, precision),
         cell({"motor.torque": 1.0, "flagella.phase_difference": 0.4, **common}, precision),
-        touching_cell({"flagella.length": 1.6, **common}, precision),
+        touching_cell({"flagella.length": 1.6, "numerics.time_step": 2e-6, **common}, precision),
         cell({"flagella.count": 3, "fluid.viscosity": 2e-3, "numerics.time_step": 4e-6, **common}, precision),
-        cell({"flagella.stretching_stiffness": 1e4, "flagellum.1.length": 1.0, "motor.torque": 0.5, **common}, precision),
+        cell(
+            {"flagella.stretching_stiffness": 1e4, "flagellum.1.length": 1.0, "motor.torque": 0.1, **common}, precision
+        ),
     ]
 
 

@@ -372,6 +372,197 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
     y = b.increment(right[:6], right[6:].reshape(-1, 4))
     banded.solve(b.model, b.state, band, y)
     assert band.singular.numpy()[0] == 0
-    condition = {"float64": 1.0, "float32": 1.0}[precision]
-    print(h, ablation, precision, np.abs(flat(y) - x).max(), np.abs(np.linalg.solve(system, right) - x).max(), np.linalg.cond(system))
-    assert close(flat(y), np.linalg.solve(system, right), precision, condition)
+    for part in (slice(0, 6), displacements(b), spins(b)):
+        assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision)
+
+
+def displacements(b: Bench) -> np.ndarray:
+    """Where the displacements of nodes r_1..r_N stand in a dense vector."""
+    free = np.setdiff1d(np.arange(b.count), b.first)
+    return (6 + 4 * free[:, None] + np.arange(3)).ravel()
+
+
+def spins(b: Bench) -> np.ndarray:
+    return np.arange(9, 6 + 4 * b.count, 4)
+
+
+def dense_solver(b: Bench, step: float, weight: float) -> np.ndarray:
+    """P: from velocities of (body, nodes) to the increment, with the local mobility in the matrix."""
+    return np.linalg.solve(dense_system(b, step, weight), b.local_inverse())
+
+
+@pytest.mark.parametrize("mode", ["all", "between"])
+def test_corrections_lead_to_the_solution_with_the_full_mobility(mode, device, precision):
+    """(1/dt + g M H) e = v without contact, whatever the weight in the matrix."""
+    values = {"hydrodynamics.mode": mode, "steric.enabled": False, "body.contact": False, "flagellum.1.length": 0.8}
+    exact, b = (bench(values, p, device) for p in ("float64", precision))
+    step, gain = 1e-5, 2 / 3
+    exact.factorise(step, 1.3 * gain)
+    band = b.factorise(step, 1.3 * gain)
+    velocities = np.random.default_rng(6).uniform(-1, 1, 6 + 4 * b.count)
+    velocities[(6 + 4 * b.first[:, None] + np.arange(3)).ravel()] = 0.0
+    system = np.eye(6 + 4 * b.count) / step + gain * exact.mobility() @ exact.hessian()
+    solution = np.linalg.solve(system, velocities)
+    drive = b.increment(velocities[:6], velocities[6:].reshape(-1, 4))
+    x = b.increment(*np.split(exact.local_inverse() @ velocities, [6]) if False else (0.0, 0.0))
+    b.stepper._response.gain.fill_(gain)
+    errors = []
+    for _ in range(30):
+        correction.correct(
+            b.model, b.state, b.stepper._stiffness, band, b.stepper._contacts, b.stepper._response,
+            drive, x, b.stepper._defect, b.stepper._scratch,
+        )  # fmt: skip
+        errors.append(np.abs(flat(x) - solution).max())
+    print(mode, precision, [f"{e / np.abs(solution).max():.1e}" for e in errors[::5]])
+    for part in (slice(0, 6), displacements(b), spins(b)):
+        print(np.abs(flat(x)[part]-solution[part]).max()/np.abs(solution[part]).max())
+        assert close(flat(x)[part], solution[part], precision)
+
+
+# Contacts.
+
+
+def contact_list(b: Bench) -> dict[tuple[int, int], dict[str, Any]]:
+    """What the search found, by (segment, other segment or -1 for the body)."""
+    c, count = b.stepper._contacts, b.stepper._contacts.count.numpy()[0]
+    assert c.overflow.numpy()[0] == 0
+    names = ("segment", "other", "at", "at_other", "normal", "gap")
+    columns = {name: getattr(c, name).numpy()[:count] for name in names}
+    found = {}
+    for i in range(count):
+        row = {name: column[i] for name, column in columns.items()}
+        found[int(row["segment"]), int(row["other"])] = row
+    assert len(found) == count  # none twice
+    return found
+
+
+def expected_contacts(b: Bench, reach: float) -> dict[tuple[int, int], float]:
+    """Every pair of segments of different flagella, and of a node and the body, nearer than `reach`: its gap."""
+    near, ends = {}, np.append(b.first, b.count)
+    for k, x in enumerate(b.start.positions):
+        for j, y in list(enumerate(b.start.positions))[k + 1 :]:
+            distances = segment_distances(x[:-1], np.diff(x, axis=0), y[:-1], np.diff(y, axis=0))
+            for e, o in np.argwhere(distances < reach):
+                near[int(ends[k] + 1 + e), int(ends[j] + 1 + o)] = distances[e, o]
+        for e, gap in enumerate(body_gaps(b.scene, b.start, x[1:]), start=1):
+            if gap < reach:
+                near[int(ends[k] + e), -1] = gap
+    return near
+
+
+def touching(values: dict[str, Any], precision: str, device: str, seed: int = 1) -> Bench:
+    scene = touching_cell({"flagella.length": 1.0, **values}, precision)
+    return Bench(scene, shaken(scene, seed, node=2e-3, spin=0.05), device)
+
+
+CROWD = {"flagella.count": 3, "flagellum.2.azimuth": 357.0, "flagellum.1.length": 1.2, "flagella.opening_angle": 90.0}
+
+
+@pytest.mark.parametrize("values", [{}, CROWD], ids=["two", "three"])
+def test_search_finds_every_contact_and_nothing_else(values, device, precision):
+    total = 0
+    for seed in range(4):
+        b = touching(values, precision, device, seed)
+        contacts.find(b.model, b.state, b.stepper._now, b.stepper._contacts)
+        found, reach = contact_list(b), (CUTOFF + contacts.MARGIN) * 0.04
+        exact = expected_contacts(b, reach + 1e-6)
+        assert found.keys() <= exact.keys()
+        assert all(gap > reach - 1e-6 for pair, gap in exact.items() if pair not in found)
+        x = b.data.position.numpy().astype(np.float64)
+        for (e, other), row in found.items():
+            assert abs(row["gap"] - exact[e, other]) < 1e-6
+            if other >= 0:
+                here = x[e - 1] + row["at"] * (x[e] - x[e - 1])
+                there = x[other - 1] + row["at_other"] * (x[other] - x[other - 1])
+                assert np.abs(here - there - row["gap"] * row["normal"]).max() < 1e-6
+            else:
+                # Straight off the surface: along the normal the gap grows as fast as the node moves.
+                away = b.start.body_position + x[e] + np.array([[0.0], [0.01]]) * row["normal"]
+                assert np.diff(body_gaps(b.scene, b.start, away))[0] == pytest.approx(0.01, abs=1e-6)
+        total += len(found)
+    assert total > 40
+
+
+def dense_levers(b: Bench) -> np.ndarray:
+    """B: unit contact forces on (body, nodes), shape [6 + 4 count, contacts]."""
+    columns = []
+    arms = np.concatenate(b.start.positions) - b.start.body_position
+    for (e, other), row in contact_list(b).items():
+        forces = np.zeros((b.count, 3))
+        n = row["normal"].astype(np.float64)
+        body = np.zeros(6)
+        if other < 0:
+            forces[e] = n
+            body = -np.concatenate([n, np.cross(arms[e], n)])
+        else:
+            for sign, second, at in ((1, e, row["at"]), (-1, other, row["at_other"])):
+                forces[second] += sign * at * n
+                forces[second - 1] += sign * (1 - at) * n
+        on_anchor = forces[b.first]
+        body += np.concatenate([on_anchor, np.cross(arms[b.first], on_anchor)], axis=1).sum(axis=0)
+        forces[b.first] = 0.0
+        columns.append(np.concatenate([body, np.hstack([forces, np.zeros((b.count, 1))]).ravel()]))
+    return np.stack(columns, axis=1)
+
+
+def steric_force(gap: np.ndarray) -> np.ndarray:
+    """F_0 [2 (sigma/r)^13 - (sigma/r)^7] below the cutoff, along its tangent below 0.7 sigma [pN]."""
+    x = np.asarray(gap, dtype=np.float64) / 0.04
+    y = 1 / np.clip(x, 0.7, CUTOFF)
+    slope = 26 * 0.7**-14 - 7 * 0.7**-8
+    return np.where(x < CUTOFF, 0.8 * (2 * y**13 - y**7 + slope * np.maximum(0.7 - x, 0.0)), 0.0)
+
+
+@dataclass
+class Responded:
+    """A step's answer at the contacts: dense B, P, Y = P(g M B), free increment e_0, and the stepper's e_0 + Y F."""
+
+    bench: Bench
+    levers: np.ndarray
+    columns: np.ndarray
+    free: np.ndarray
+    step: Any
+
+    def own(self, name: str) -> np.ndarray:
+        count = self.levers.shape[1]
+        return getattr(self.bench.stepper._response, name).numpy()[:count].astype(np.float64)
+
+
+def responded(b: Bench, step: float = 1e-5, gain: float = 2 / 3) -> Responded:
+    band = b.factorise(step, 1.3 * gain)
+    s = b.stepper
+    s._response.gain.fill_(gain)
+    s._response.failed.zero_()
+    contacts.find(b.model, b.state, s._now, s._contacts)
+    levers = dense_levers(b)
+    solver = dense_solver(b, step, 1.3 * gain)
+    # Nodes pushed together, some through each other.
+    push = -2e-3 * levers.sum(axis=1)
+    free, out = b.increment(0.0, push[6:].reshape(-1, 4)), b.increment()
+    hessian.joint_stiffness(b.model, b.state, s._stiffness)
+    response.respond(b.model, b.state, s._contacts, band, s._response, s._groups, free, out)
+    return Responded(b, levers, solver @ (gain * b.mobility() @ levers), flat(free), out)
+
+
+RESPONSES = {"all": {}, "none": {"hydrodynamics.mode": "none"}, "within": {"hydrodynamics.mode": "within"}}
+RESPONSES |= {"between": {"hydrodynamics.mode": "between"}, "three": CROWD, "anchored": {"body.anchored": True}}
+
+
+@pytest.mark.parametrize("name", list(RESPONSES))
+def test_contacts_answer_as_dense_matrices_do_and_obey_the_law(name, device, precision):
+    r = responded(touching(RESPONSES[name], precision, device))
+    b, count = r.bench, r.levers.shape[1]
+    assert b.stepper._response.failed.numpy()[0] == 0
+    compliance = r.own("compliance") if count == 1 else None
+    w = b.stepper._response.compliance.numpy()[: count * count].reshape(count, count).astype(np.float64)
+    exact = r.levers.T @ r.columns
+    print(name, precision, count, np.abs(w - exact).max() / np.abs(exact).max())
+    assert close(w, exact, precision)
+    gaps, force = r.own("solved_gap"), r.own("force")
+    listed = b.stepper._contacts.gap.numpy()[:count].astype(np.float64)
+    assert np.abs(force - steric_force(gaps)).max() < 1e-4 * force.max()
+    print("closed", (force > 0).sum(), force.max(), np.abs(listed + r.levers.T @ r.free + exact @ force - gaps).max())
+    assert np.abs(listed + r.levers.T @ r.free - r.own("free_gap")).max() < 1e-6
+    assert np.abs(listed + r.levers.T @ r.free + exact @ force - gaps).max() < 1.1 * response.ROUGH * 0.04
+    assert close(flat(r.step), r.free + r.columns @ force, precision)
+    assert 3 < (force > 0).sum() < count

@@ -29,7 +29,7 @@ def test_a_run_leaves_record_movie_scene_and_summary(tmp_path):
         for name, values in record.observables.items():
             np.testing.assert_array_equal(said["observables"][name], values[-1])
     assert said["status"] == "done" and said["guards"]["violated"] is None
-    assert (said["device"], said["precision"], said["stepper"]) == ("cpu", "float64", "rkc")
+    assert (said["device"], said["precision"], said["stepper"]) == ("cpu", "float64", "implicit")
     assert said["wall_time"] > 0 and said["rejected_steps"] == 0 and said["evaluations"] > said["steps"]
     assert said["versions"].keys() >= {"warpflag", "warp-lang", "python"} and "-march=native" in said["kernel_flags"]
 

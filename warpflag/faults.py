@@ -24,6 +24,10 @@ _ADVICE = {
         "a joint is folded back on itself",
         "take a shorter numerics.time_step or a lower motor.torque",
     ),
+    Fault.TURN: (
+        "its motor turns by more than 2 rad in one step",
+        "take a shorter numerics.time_step or a lower motor.torque",
+    ),
     Fault.UNSOLVED: (
         "no step, however short, could be solved",
         "take numerics.stepper = rkc, a lower steric.strength or a lower motor.torque",

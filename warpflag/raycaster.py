@@ -12,7 +12,7 @@ from warpflag.usd_read import Camera, Rods
 
 __all__ = ["draw"]
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 
 _SCREEN_TOP, _SCREEN_BOTTOM = "#fafbfc", "#dde5ee"
 _SCREEN_GAP = 0.6  # um, from the farthest thing to the screen
@@ -29,6 +29,7 @@ def draw(
     """
     import warp as wp
     from warpflag_kernels import raycast
+    from warpflag_kernels.rays import Capsules
 
     middle = camera.eye - camera.focus * camera.back  # the scene is near it: small coordinates for single precision
     start, end, eye = rods.start - middle, rods.end - middle, camera.focus * camera.back
@@ -42,7 +43,7 @@ def draw(
         return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.vec3, device=device)
 
     bvh = wp.Bvh(vectors(np.minimum(start, end) - reach), vectors(np.maximum(start, end) + reach))
-    capsules = raycast.Capsules()
+    capsules = Capsules()
     capsules.bvh = bvh.id
     capsules.start, capsules.end = vectors(start), vectors(end)
     capsules.radius = wp.array(rods.radius.astype(np.float32), dtype=wp.float32, device=device)

@@ -82,6 +82,7 @@ class Simulation:
         self.reporters = list(reporters)
         self._framed: CellState | None = None
         self._capture, self._graph = capture, None
+        self._checked = False
         self._passes_per_replay = 200
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
         self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
@@ -172,6 +173,8 @@ class Simulation:
             self._raise_fault()
             return
         self.prepare()
+        if not self._checked:
+            self._check_start()
         control.target.fill_(until)
         state.active.assign(waiting.astype(np.int32))
         control.unfinished.fill_(int(waiting.sum()))
@@ -294,6 +297,18 @@ class Simulation:
         self._place()
         self.system.state.data.active.zero_()
         return self.cell_state()
+
+    def _check_start(self) -> None:
+        """The guards look at the state that the first step starts from."""
+        model, s, chart = self.system.model, self.system.state, self.system.chart
+        self._place()
+        launch_right_hand_side(model, s)
+        chart.rest.fill_(1)
+        guard.check(model, s, chart, self.system.guard, self.system.control)
+        chart.rest.zero_()
+        s.data.active.zero_()
+        self._checked = True
+        self._raise_fault()
 
     def _raise_fault(self) -> None:
         faults = self.system.control.fault.numpy()

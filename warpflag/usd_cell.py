@@ -28,7 +28,7 @@ __all__ = ["Cell"]
 
 _SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
 _SPOKE_WIDTH = 0.07
-_SPOKE_COLORS = ("#f2b01e", "#39424e", "#39424e")
+_SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
 
 
 class Cell:
@@ -51,6 +51,7 @@ class Cell:
         time = self.prim.CreateAttribute("warpflag:time", Sdf.ValueTypeNames.Double, custom=True)
         time.SetDocumentation("Simulated time [s].")
         self._time = self._animate(time)
+        UsdGeom.Scope.Define(stage, f"{path}/Looks")
         body = self._add_body()
         self._poses = [self._add_pose(body), self._add_pose(UsdGeom.Xform.Define(stage, f"{path}/Motors"))]
         self._turns = self._add_motors()

@@ -16,7 +16,7 @@ from warpflag.output import OutputError
 
 __all__ = ["Camera", "Film", "Rods"]
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 
 _PIECES = 4  # straight pieces per span of a cubic curve
 # Catmull-Rom weights of the four points about a span, at the ends of its pieces; a linear curve has one piece.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Extent", "add_camera", "add_lights", "arranged", "body_axes", "steady_path", "view_axes"]
 
-Array = NDArray[np.floating]
+Array = NDArray[np.float64]
 
 _FOCAL_LENGTH = 60.0  # in tenths of a scene unit as the apertures; only their ratio counts
 _WIDEST = 16 / 9
@@ -25,14 +25,14 @@ _SIDES[:4, 2] = np.repeat(_TANGENTS, 2)
 _ELEVATION = np.radians(12.0)  # the camera looks down a little, so that coils read as coils
 
 
-def body_axes(orientation: NDArray[np.floating]) -> NDArray[np.float64]:
+def body_axes(orientation: NDArray[np.floating]) -> Array:
     """e_b1, e_b2, e_b3 in the lab as rows, of a quaternion (x, y, z, w)."""
     x, y, z, w = orientation
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return (np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross).T
 
 
-def view_axes(orientation: Array) -> NDArray[np.float64]:
+def view_axes(orientation: Array) -> Array:
     """The camera's right, up and back axes as rows, for a body of this orientation.
 
     e_b3 points to the right, so the cell swims to the left; flagella at azimuth 0 and 180 open up and down, seen
@@ -44,7 +44,7 @@ def view_axes(orientation: Array) -> NDArray[np.float64]:
     return np.stack([e3, cosine * e1 - sine * e2, cosine * e2 + sine * e1])
 
 
-def steady_path(centres: Array) -> NDArray[np.float64]:
+def steady_path(centres: Array) -> Array:
     """A path without the wobble, shape [frame, 3]: the moving average over a tenth of the frames.
 
     Both ends are continued by their mirror image through the end point, which keeps a straight path as it is.
@@ -81,21 +81,21 @@ class Extent:
         self.reach = np.maximum(self.reach, reach)
 
 
-def arranged(reaches: Sequence[Array]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def arranged(reaches: Sequence[Array]) -> tuple[Array, Array]:
     """How to shift cells so that they stand in rows that fill a picture, and the reach of them all.
 
     reaches: of each cell's `Extent`. Returns shifts in the camera's axes [um], shape [cell, 3]. A single cell stays.
     """
-    reaches = np.asarray(reaches)
     count = len(reaches)
     if count == 1:
         return np.zeros((1, 3)), reaches[0]
-    middles = np.stack([reaches[:, 0] - reaches[:, 1], reaches[:, 2] - reaches[:, 3], np.zeros(count)], axis=1) / 2
-    width, height = 1.05 * (reaches[:, :4:2] + reaches[:, 1:4:2]).max(axis=0)
+    right, left, up, down, *_ = sides = np.stack(reaches, axis=1)
+    middles = np.stack([right - left, up - down, np.zeros(count)], axis=1) / 2
+    width, height = 1.05 * (right + left).max(), 1.05 * (up + down).max()
     columns = min(range(1, count + 1), key=lambda n: max(n * width, -(-count // n) * height * _WIDEST))
     row, column = np.divmod(np.arange(count), columns)
     shifts = np.stack([column * width, -row * height, np.zeros(count)], axis=1) - middles
-    return shifts, (reaches + shifts @ _SIDES.T).max(axis=0)
+    return shifts, (sides + _SIDES @ shifts.T).max(axis=1)
 
 
 def add_camera(stage: Any, view: Array, reach: Array, path: Array | None = None) -> None:

@@ -29,12 +29,12 @@ ABLATIONS = {
 """The paper's Fig. 4, (i), (ii), (iii), (iv), (v), (vi), and three more."""
 
 
-def scene(name: str, duration: float, values: dict | None = None, angle: int = 23) -> Scene:
-    """Two flagella at one opening angle with other values; `duration` in s."""
+def scene(name: str, duration: float, values: dict | None = None, angle: int = 23, frame: float = FRAME) -> Scene:
+    """Two flagella at one opening angle with other values; duration and time between frames in s."""
     changed = {
         "name": name,
         "duration": duration,
-        "frames": round(duration / FRAME),
+        "frames": round(duration / frame),
         "flagella.opening_angle": float(angle),
         "flagella.phase_difference": ANGLES[angle],
         "numerics.stepper": "implicit",
@@ -85,7 +85,7 @@ def torques() -> dict[str, Scene]:
     for torque, duration in ((1.0, 0.060), (0.38, 0.100), (0.34, 0.300)):
         for angle in (23, 90) if torque == 1.0 else (23,):
             name = f"phi{angle}-T{torque:g}"
-            runs[name] = scene(name, duration, {"motor.torque": torque}, angle)
+            runs[name] = scene(name, duration, {"motor.torque": torque}, angle, FRAME * 3.4 / torque)
     return runs
 
 

@@ -47,8 +47,8 @@ STAR = [
     ),
     *({"apart": angle} for angle in (60.0, 90.0, 120.0)),
     *({"motor.torque": torque} for torque in (1.0, 1.5, 5.0)),
-    {"motor.axis_angle": 35.0},
-    {"motor.axis_angle": 75.0},
+    *({"motor.axis_angle": angle} for angle in (35.0, 65.0, 70.0, 75.0)),
+    {"motor.axis_angle": 75.0, "motor.torque": 2.0},
     {"flagella.length": 10.0},
     {"flagella.segment_length": 0.1},
     {"flagella.segment_length": 0.3},
@@ -180,14 +180,20 @@ def tables(results: dict[str, tuple[float, float, str]]) -> str:
             at = np.array([values_of[name][factor] == level for name in crossed])
             means = " | ".join(f"{np.nanmean(found[at]):+.1f}" for found in delays.values())
             lines.append(f"| {factor} | {level} | {means} |")
-    lines += ["", "## One thing at a time, from the standard run", ""]
-    lines += ["| change | zip | " + " | ".join(PAIRS) + " |", "|---|---:" + "|---:" * len(PAIRS) + "|"]
+    lines += ["", "## One thing at a time, from the standard run: zip [ms] and delays", ""]
+    lines += ["| change | " + " | ".join((*HYDRODYNAMICS, *PAIRS)) + " |"]
+    lines += ["|---" + "|---:" * (len(HYDRODYNAMICS) + len(PAIRS)) + "|"]
     standard = next(name for name in crossed if values_of[name] == STANDARD)
     for name, values in {standard: STANDARD, **star}.items():
         change = ", ".join(f"{key} = {value:g}" for key, value in values.items() if STANDARD.get(key) != value)
-        found = " | ".join(_signed(_delay(by_point[name], pair)) for pair in PAIRS)
-        lines.append(f"| {change or 'none'} | {by_point[name]['all']:.1f} | {found} |".replace("nan", "never"))
+        cells = [_cell(*results[f"{name} {hydrodynamics}"][1:]) for hydrodynamics in HYDRODYNAMICS]
+        cells += ["" if np.isnan(delay) else f"{delay:+.1f}" for delay in (_delay(by_point[name], p) for p in PAIRS)]
+        lines.append(f"| {change or 'none'} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _cell(zipped: float, fault: str) -> str:
+    return "stopped" if fault else "never" if np.isnan(zipped) else f"{zipped:.1f}"
 
 
 def _crossed(values: dict) -> bool:
@@ -197,10 +203,6 @@ def _crossed(values: dict) -> bool:
 def _delay(zips: dict[str, float], pair: str) -> float:
     with_interaction, without = PAIRS[pair]
     return zips[without] - zips[with_interaction]
-
-
-def _signed(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:+.1f}"
 
 
 if __name__ == "__main__":

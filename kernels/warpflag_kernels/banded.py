@@ -4,8 +4,9 @@
 
 D is the local mobility, H the elastic Hessian. Unknowns of element i are (node increment, spin increment), so a joint
 couples elements i, i + 1, i + 2: K is symmetric and block pentadiagonal with 4 x 4 blocks, and is factorised as
-C C^T along the flagellum (block Cholesky; an inverse by cofactors in its place loses all digits on fine meshes). The rows of r_0, which moves with the body, are unit rows; its coupling
-goes through the six unknowns of the body (u, w) and a Schur complement:
+C C^T along the flagellum (block Cholesky; an inverse by cofactors in its place loses all digits on fine meshes). The
+rows of r_0, which moves with the body, are unit rows; its coupling goes through the six unknowns of the body (u, w)
+and a Schur complement:
 
     S = 1 + dt s M_b (H_bb - H_bf W),    W = K^-1 s H_fb
 """
@@ -525,7 +526,7 @@ def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any)
 
 
 def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
-    """P: from D^-1 times node and spin velocities, and the bodies' velocities, to the increment they cause; in place."""
+    """P: from D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place."""
     kernels = _kernels(model.precision, model.switches.bearing_torque)
     inputs, device = [model.data, state.data, band, x], model.device
     wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)

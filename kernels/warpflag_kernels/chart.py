@@ -184,11 +184,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = wp.tid()
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
-        # Turn of the body in this step: twice the angle of the relative quaternion's part along the axis.
-        turn_of_body = state.body_orientation[c] * wp.quat_inverse(chart.base_body_orientation[c])
-        vector = wp.vec3d(turn_of_body[0], turn_of_body[1], turn_of_body[2])
-        along = wp.dot(vector, wp.vec3d(state.body_axis[c]))
-        chart.body_angle[c] += wp.float64(2.0) * wp.atan2(along, turn_of_body[3])
+        b = chart.body_increment[c]
+        chart.body_angle[c] += wp.dot(wp.vec3d(b[3], b[4], b[5]), wp.vec3d(state.body_axis[c]))
         chart.base_body_position[c] = state.body_position[c]
         chart.base_body_orientation[c] = state.body_orientation[c]
         chart.body_increment[c] = vec6d(wp.float64(0.0))

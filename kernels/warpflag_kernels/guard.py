@@ -22,6 +22,7 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 LARGEST_STRAIN = 0.05
 LARGEST_TWIST = 0.5 * 3.141592653589793  # per joint [rad]
 SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
+LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
 ELEMENT_BITS = 26
 
 
@@ -34,6 +35,7 @@ class Fault(IntEnum):
     TWIST = 3
     FOLD = 4
     UNSOLVED = 5
+    TURN = 6
 
 
 def encode(kind: Fault) -> int:
@@ -70,6 +72,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
+    turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
     module = p.module("guard")
 
     @wp.func(module=module)
@@ -103,9 +106,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e]) and directed):
             wp.atomic_min(control.fault, c, not_finite + e)
             return
-        if e > model.first_node[k]:
-            if wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
-                wp.atomic_min(control.fault, c, strained + e)
+        if e == model.first_node[k] and wp.abs(chart.increment[e][3]) > largest_turn:
+            wp.atomic_min(control.fault, c, turned + e)
+        if e > model.first_node[k] and wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
+            wp.atomic_min(control.fault, c, strained + e)
         if e + 1 < model.first_node[k + 1]:
             t = state.tangent[e]
             u = state.tangent[e + 1]
@@ -208,9 +212,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 away = middle - real(0.5) * (p2n + q2n)
                 reach = real(0.5) * (state.length[e] + state.length[j]) + touch
                 reach += moved + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
-                if wp.dot(away, away) < reach * reach:
-                    if crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
-                        wp.atomic_min(control.fault, c, crossing + e)
+                if wp.dot(away, away) < reach * reach and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
+                    wp.atomic_min(control.fault, c, crossing + e)
             j += 1
 
     @wp.kernel(module=module)

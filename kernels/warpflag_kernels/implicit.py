@@ -18,6 +18,7 @@ import warp as wp
 
 from warpflag_kernels import banded, chain, contacts, response, step_control
 from warpflag_kernels import chart as chart_stage
+from warpflag_kernels.chart import vec6d
 from warpflag_kernels.control import NO_FAULT, Control
 from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
@@ -174,6 +175,17 @@ def kernels(p: Precision) -> SimpleNamespace:
             return
         if k == model.first_flagellum[c]:
             chart.commit[c] = 1  # the guards look at this pose
+            b = real(imp.ratio[c]) * last.body[c] + x.body[c]
+            chart.body_increment[c] = vec6d(
+                wp.float64(b[0]),
+                wp.float64(b[1]),
+                wp.float64(b[2]),
+                wp.float64(b[3]),
+                wp.float64(b[4]),
+                wp.float64(b[5]),
+            )
+        turn = real(imp.ratio[c]) * last.node[first][3] + x.node[first][3]
+        chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), turn)
         worst = real(0.0)
         if imp.history[c] == 2:
             # Third divided difference of the increments: what a quadratic path leaves over.

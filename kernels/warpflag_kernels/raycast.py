@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.rays import FAR, MODULE, Capsules, capsule_hit, is_dark, nearest_hit
+
 SAMPLES = 3
 """Rays along each side of a pixel that shows more than background."""
 SAMPLES_INSIDE = 2
@@ -21,25 +23,10 @@ LIGHT_SAMPLES = SAMPLES * SAMPLES
 SHADOW_CELL = 4
 """Pixels along each side of a cell of the screen's shadow."""
 
-_MODULE = wp.get_module("warpflag_kernels.raycast")
-_MODULE.options.update({"enable_backward": False, "cpu_compiler_flags": "-march=native", "fast_math": False})
 _SampleRays = wp.types.matrix((LIGHT_SAMPLES, 3), wp.float32)
 _SampleDistances = wp.types.vector(LIGHT_SAMPLES, wp.float32)
 _SampleHits = wp.types.vector(LIGHT_SAMPLES, wp.int32)
-_FAR = wp.constant(1.0e9)
 _OUTWARD = wp.constant(2.0e-3)  # um, from a surface to where its shadow ray starts
-
-
-@wp.struct
-class Capsules:
-    """Rods with round ends, [N] each; linear RGB at both ends."""
-
-    bvh: wp.uint64  # over their bounds, each wider by a pixel of the picture
-    start: wp.array(dtype=wp.vec3)  # [um]
-    end: wp.array(dtype=wp.vec3)  # [um]
-    radius: wp.array(dtype=wp.float32)  # [um]
-    color_start: wp.array(dtype=wp.vec3)
-    color_end: wp.array(dtype=wp.vec3)
 
 
 @wp.struct
@@ -65,68 +52,6 @@ class View:
     screen_bottom: wp.vec3
     vignette: wp.float32  # share of the screen's light that is missing in a corner
     shade: wp.float32  # share of it that a shadow takes
-
-
-@wp.func
-def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec3, radius: wp.float32):
-    """Distance along a ray to where it enters a capsule; _FAR where it doesn't."""
-    # Seen from the point of the ray beside the capsule: the squares below stay small.
-    shift = wp.dot(0.5 * (start + end) - origin, direction)
-    from_start = origin + shift * direction - start
-    axis = end - start
-    axis_axis = wp.dot(axis, axis)
-    axis_ray = wp.dot(axis, direction)
-    axis_from = wp.dot(axis, from_start)
-    ray_from = wp.dot(direction, from_start)
-    a = axis_axis - axis_ray * axis_ray
-    b = axis_axis * ray_from - axis_from * axis_ray
-    c = axis_axis * (wp.dot(from_start, from_start) - radius * radius) - axis_from * axis_from
-    along = axis_from - ray_from * axis_ray  # where the ray passes, for a ray along the axis or a sphere
-    if a > 1.0e-7 * axis_axis:
-        root = b * b - a * c
-        if root < 0.0:
-            return _FAR
-        t = (-b - wp.sqrt(root)) / a
-        along = axis_from + t * axis_ray
-        if along > 0.0 and along < axis_axis:
-            return shift + t
-    elif axis_ray < 0.0:
-        along = axis_axis
-    from_cap = from_start
-    if along >= axis_axis:
-        from_cap = from_start - axis
-    b = wp.dot(direction, from_cap)
-    root = b * b - wp.dot(from_cap, from_cap) + radius * radius
-    if root < 0.0:
-        return _FAR
-    return shift - b - wp.sqrt(root)
-
-
-@wp.func
-def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
-    """Distance to the first capsule on a ray and its index, or _FAR and -1."""
-    nearest = _FAR
-    hit = int(-1)
-    index = int(0)
-    query = wp.bvh_query_ray(capsules.bvh, origin, direction)
-    while wp.bvh_query_next(query, index, nearest):
-        t = capsule_hit(origin, direction, capsules.start[index], capsules.end[index], capsules.radius[index])
-        if t > 0.0 and t < nearest:
-            nearest = t
-            hit = index
-    return nearest, hit
-
-
-@wp.func
-def is_dark(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
-    """Whether anything stands between a point and the light."""
-    index = int(0)
-    query = wp.bvh_query_ray(capsules.bvh, origin, direction)
-    while wp.bvh_query_next(query, index):
-        t = capsule_hit(origin, direction, capsules.start[index], capsules.end[index], capsules.radius[index])
-        if t > 0.0 and t < _FAR:
-            return True
-    return False
 
 
 @wp.func
@@ -186,7 +111,7 @@ def encoded(linear: wp.float32):
     return wp.uint8(255.0 * y + 0.5)
 
 
-@wp.kernel(module=_MODULE)
+@wp.kernel(module=MODULE)
 def _find(
     # Scene:
     capsules: Capsules,
@@ -201,7 +126,7 @@ def _find(
     hit_out[pixel] = hit
 
 
-@wp.kernel(module=_MODULE)
+@wp.kernel(module=MODULE)
 def _cast_shadow(
     # Scene:
     capsules: Capsules,
@@ -219,7 +144,7 @@ def _cast_shadow(
     shadow_out[i, j] = dark / float(LIGHT_SAMPLES)
 
 
-@wp.kernel(module=_MODULE)
+@wp.kernel(module=MODULE)
 def _smooth(
     # Scene:
     shadow: wp.array2d(dtype=wp.float32),
@@ -235,7 +160,7 @@ def _smooth(
     shadow_out[i, j] = total / 81.0
 
 
-@wp.kernel(module=_MODULE)
+@wp.kernel(module=MODULE)
 def _paint(
     # Scene:
     capsules: Capsules,
@@ -267,7 +192,7 @@ def _paint(
     if empty:
         side = 0
     rays = _SampleRays()
-    nearest = _SampleDistances(_FAR)
+    nearest = _SampleDistances(FAR)
     hits = _SampleHits(-1)
     count = side * side
     for k in range(count):
@@ -277,7 +202,7 @@ def _paint(
     # One walk through the tree for all of them: its boxes are wider by a pixel.
     if not empty:
         index = int(0)
-        farthest = float(_FAR)
+        farthest = float(FAR)
         query = wp.bvh_query_ray(capsules.bvh, view.eye, ray_through(view, float(column) + 0.5, float(row) + 0.5))
         while wp.bvh_query_next(query, index, farthest):
             start, end, radius = capsules.start[index], capsules.end[index], capsules.radius[index]

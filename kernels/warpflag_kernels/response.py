@@ -71,6 +71,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
     module = p.module("response", pairs)
     group = wp.constant(GROUP)
     iterations, halvings = wp.constant(NEWTON_ITERATIONS), wp.constant(HALVINGS)
+    infinite = wp.constant(real(3.0e38))
 
     @wp.func(module=module)
     def extended(f: vec3):
@@ -118,21 +119,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         d = state.position[e] - state.position[source]
         return model.pair_mobility[c] * rotne_prager(d, force, model.pair_radius[c])
 
-    @wp.kernel(module=module)
-    def right_hand_sides(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        contacts_in: Contacts,
-        # Out:
-        response: Response,
+    @wp.func(module=module)
+    def right_hand_sides_of_group(
+        model: Model, state: State, contacts_in: Contacts, response: Response, e: wp.int32, g: wp.int32
     ):
-        e, g = wp.tid()
         c = model.cell_of[e]
         count = contacts_in.count[c]
-        if state.active[c] == 0 or g * group >= count:
-            return
         gain = real(response.gain[c])
         k = model.flagellum_of[e]
         block = mat4g(real(0.0))
@@ -174,21 +166,29 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         response.columns[column_of(model, response, c, g, e)] = block
 
     @wp.kernel(module=module)
-    def solve_flagella(
+    def right_hand_sides(
         # Model:
         model: Model,
         # State:
         state: State,
         contacts_in: Contacts,
-        band: Band,
+        lanes: wp.int32,
         # Out:
         response: Response,
     ):
-        k, g = wp.tid()
+        e, lane = wp.tid()
+        c = model.cell_of[e]
+        g = int(lane)
+        while state.active[c] != 0 and g * group < contacts_in.count[c]:
+            right_hand_sides_of_group(model, state, contacts_in, response, e, g)
+            g += lanes
+
+    @wp.func(module=module)
+    def solve_flagella_of_group(
+        model: Model, state: State, contacts_in: Contacts, band: Band, response: Response, k: wp.int32, g: wp.int32
+    ):
         first = model.first_node[k]
         c = model.cell_of[first]
-        if state.active[c] == 0 or g * group >= contacts_in.count[c]:
-            return
         start = column_of(model, response, c, g, first)
         size = model.first_node[k + 1] - first
         y1 = mat4g(real(0.0))
@@ -221,20 +221,29 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             i -= 1
 
     @wp.kernel(module=module)
-    def solve_bodies(
+    def solve_flagella(
         # Model:
         model: Model,
         # State:
         state: State,
         contacts_in: Contacts,
         band: Band,
+        lanes: wp.int32,
         # Out:
         response: Response,
     ):
-        c, g = wp.tid()
+        k, lane = wp.tid()
+        c = model.cell_of[model.first_node[k]]
+        g = int(lane)
+        while state.active[c] != 0 and g * group < contacts_in.count[c]:
+            solve_flagella_of_group(model, state, contacts_in, band, response, k, g)
+            g += lanes
+
+    @wp.func(module=module)
+    def solve_bodies_of_group(
+        model: Model, state: State, contacts_in: Contacts, band: Band, response: Response, c: wp.int32, g: wp.int32
+    ):
         count = contacts_in.count[c]
-        if state.active[c] == 0 or g * group >= count:
-            return
         back = mat6g(real(0.0))
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -261,6 +270,33 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         response.body_columns[contacts_in.first[c] / group + g] = real(band.step[c]) * (band.body_inverse[c] * rates)
 
     @wp.kernel(module=module)
+    def solve_bodies(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        band: Band,
+        lanes: wp.int32,
+        # Out:
+        response: Response,
+    ):
+        c, lane = wp.tid()
+        g = int(lane)
+        while state.active[c] != 0 and g * group < contacts_in.count[c]:
+            solve_bodies_of_group(model, state, contacts_in, band, response, c, g)
+            g += lanes
+
+    @wp.func(module=module)
+    def follow_bodies_of_group(
+        model: Model, state: State, contacts_in: Contacts, band: Band, response: Response, e: wp.int32, g: wp.int32
+    ):
+        c = model.cell_of[e]
+        column = column_of(model, response, c, g, e)
+        body = response.body_columns[contacts_in.first[c] / group + g]
+        response.columns[column] = response.columns[column] - band.body_columns[e] * body
+
+    @wp.kernel(module=module)
     def follow_bodies(
         # Model:
         model: Model,
@@ -268,16 +304,16 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         band: Band,
+        lanes: wp.int32,
         # Out:
         response: Response,
     ):
-        e, g = wp.tid()
+        e, lane = wp.tid()
         c = model.cell_of[e]
-        if state.active[c] == 0 or g * group >= contacts_in.count[c]:
-            return
-        column = column_of(model, response, c, g, e)
-        body = response.body_columns[contacts_in.first[c] / group + g]
-        response.columns[column] = response.columns[column] - band.body_columns[e] * body
+        g = int(lane)
+        while state.active[c] != 0 and g * group < contacts_in.count[c]:
+            follow_bodies_of_group(model, state, contacts_in, band, response, e, g)
+            g += lanes
 
     @wp.func(module=module)
     def group_forces(response: Response, contacts_in: Contacts, c: wp.int32, g: wp.int32):
@@ -376,6 +412,8 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             r = response.solved_gap[first + i] - response.free_gap[first + i]
             r -= row_product(response.compliance, entry + i * count, response.force, first, count)
             response.residual[first + i] = r
+            if not wp.isfinite(r):
+                r = infinite  # a maximum would pass over what is not a number
             worst = wp.max(worst, wp.abs(r))
             i += 1
         return worst
@@ -384,9 +422,11 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
     def factorise_closed(
         response: Response, strength: real, diameter: real, first: wp.int32, entry: wp.int32, count: wp.int32
     ):
-        """Cholesky factor of (1/k + W) over the closed contacts, k the contact stiffness; how many they are.
+        """Factors L U of (1/k + W) over the closed contacts, k the contact stiffness; how many they are.
 
-        Its diagonal holds the inverses. A pivot that is not positive gives NaN, which the caller's test catches.
+        W lacks symmetry by as much as the flows of the pair sum, since the matrix behind P leaves them out: a
+        Cholesky factor of one half of it fails in a crowd. Rows of L, then columns of U, one after another without
+        gaps; L has a unit diagonal, U the inverses of its own.
         """
         closed = int(0)
         i = int(0)
@@ -395,40 +435,44 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                 response.closed[first + closed] = i
                 closed += 1
             i += 1
+        upper = entry + closed * (closed - 1) / 2
         i = int(0)
         while i < closed:
             a = response.closed[first + i]
-            row = entry + i * count
+            row = entry + i * (i - 1) / 2
+            column = upper + i * (i + 1) / 2
             j = int(0)
-            while j <= i:
-                value = response.compliance[entry + a * count + response.closed[first + j]]
-                value -= row_product(response.factor, row, response.factor, entry + j * count, j)
-                if i == j:
-                    value += real(1.0) / steric_stiffness(response.solved_gap[first + a], strength, diameter)
-                    value = real(1.0) / wp.sqrt(value)
-                else:
-                    value = value * response.factor[entry + j * count + j]
-                response.factor[row + j] = value
+            while j < i:
+                b = response.closed[first + j]
+                before = row_product(response.factor, row, response.factor, upper + j * (j + 1) / 2, j)
+                pivot = response.factor[upper + j * (j + 1) / 2 + j]
+                response.factor[row + j] = (response.compliance[entry + a * count + b] - before) * pivot
+                before = row_product(response.factor, entry + j * (j - 1) / 2, response.factor, column, j)
+                response.factor[column + j] = response.compliance[entry + b * count + a] - before
                 j += 1
+            value = response.compliance[entry + a * count + a]
+            value += real(1.0) / steric_stiffness(response.solved_gap[first + a], strength, diameter)
+            value -= row_product(response.factor, row, response.factor, column, i)
+            response.factor[column + i] = real(1.0) / value
             i += 1
         return closed
 
     @wp.func(module=module)
     def solve_closed(response: Response, first: wp.int32, entry: wp.int32, count: wp.int32, closed: wp.int32):
-        """Solves with that factor; right-hand side and solution in `change`."""
+        """Solves with those factors; right-hand side and solution in `change`."""
         i = int(0)
         while i < closed:
-            row = entry + i * count
-            value = response.change[first + i] - row_product(response.factor, row, response.change, first, i)
-            response.change[first + i] = value * response.factor[row + i]
+            row = entry + i * (i - 1) / 2
+            response.change[first + i] -= row_product(response.factor, row, response.change, first, i)
             i += 1
         i = closed - 1
         while i >= 0:
-            value = response.change[first + i] * response.factor[entry + i * count + i]
+            column = entry + closed * (closed - 1) / 2 + i * (i + 1) / 2
+            value = response.change[first + i] * response.factor[column + i]
             response.change[first + i] = value
             j = int(0)
             while j < i:
-                response.change[first + j] -= response.factor[entry + i * count + j] * value
+                response.change[first + j] -= response.factor[column + j] * value
                 j += 1
             i -= 1
 
@@ -637,10 +681,12 @@ def respond(
     kernels, device = _kernels(model.precision, model.switches.pairs), model.device
     cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
     inputs = [model.data, state.data, contacts_in]
-    wp.launch(kernels.right_hand_sides, (elements, groups), inputs=[*inputs, response], device=device)
-    wp.launch(kernels.solve_flagella, (flagella, groups), inputs=[*inputs, band, response], device=device)
-    wp.launch(kernels.solve_bodies, (cells, groups), inputs=[*inputs, band, response], device=device)
-    wp.launch(kernels.follow_bodies, (elements, groups), inputs=[*inputs, band, response], device=device)
+    # Groups beyond a cell's list cost their launch: a serial device takes them one after another in each thread.
+    lanes = 1 if device.is_cpu else groups
+    wp.launch(kernels.right_hand_sides, (elements, lanes), inputs=[*inputs, lanes, response], device=device)
+    wp.launch(kernels.solve_flagella, (flagella, lanes), inputs=[*inputs, band, lanes, response], device=device)
+    wp.launch(kernels.solve_bodies, (cells, lanes), inputs=[*inputs, band, lanes, response], device=device)
+    wp.launch(kernels.follow_bodies, (elements, lanes), inputs=[*inputs, band, lanes, response], device=device)
     wp.launch(kernels.project, (cells, groups * GROUP), inputs=[*inputs, start, response], device=device)
     wp.launch(kernels.solve_gaps, cells, inputs=[*inputs, ROUGH, response], device=device)
     wp.launch(kernels.apply_nodes, elements, inputs=[*inputs, response, start, out], device=device)

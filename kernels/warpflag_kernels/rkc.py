@@ -1,6 +1,6 @@
-"""Stabilised explicit stepping: Runge-Kutta-Chebyshev of second order (RKC2), with explicit Euler as its one-stage form.
+"""Stabilised explicit stepping: Runge-Kutta-Chebyshev of second order (RKC2), and Euler as its one-stage form.
 
-Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increments since the start of the step, Y_0 = 0:
+Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increments since the start of the step:
 
     Y_1 = m_1 dt F_0,     Y_j = mu_j Y_(j-1) + nu_j Y_(j-2) + m_j dt F_(j-1) + g_j dt F_0,     s stages.
 
