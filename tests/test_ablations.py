@@ -20,6 +20,12 @@ TOLERANCE = {"float64": 1e-9, "float32": 2e-3}
 GENTLE = {"numerics.time_step": 2e-6}  # for starts that are not at rest
 
 
+@pytest.fixture(params=["rkc", "implicit"])
+def stepper(request: pytest.FixtureRequest) -> dict[str, str]:
+    """The motions of the body also stand in the matrix of the implicit stepper."""
+    return {"numerics.stepper": request.param}
+
+
 def end_of_run(scene: Scene, device: str, start: InitialState | None = None, duration: float = 5e-5) -> CellState:
     sim = Simulation(scene, device=device, starts=start)
     sim.advance(duration)
@@ -103,16 +109,16 @@ def test_body_contact_pushes_nodes_out_and_can_be_switched_off(device, precision
     assert np.array_equal(push[untouched], np.zeros((untouched.sum(), 3)))
 
 
-def test_body_without_translation_stays_and_turns(device, precision):
-    free, held = (end_of_run(cell({"body.translation": on}, precision), device) for on in (True, False))
+def test_body_without_translation_stays_and_turns(stepper, device, precision):
+    free, held = (end_of_run(cell({"body.translation": on, **stepper}, precision), device) for on in (True, False))
     assert np.linalg.norm(free.body_position) > 1e-3
     assert np.array_equal(held.body_position, np.zeros(3))
     assert abs(held.body_angle) > 1e-2
     assert abs(held.body_orientation[3]) < 1 - 1e-6
 
 
-def test_body_without_axial_rotation_tumbles_but_does_not_spin(device, precision):
-    scene = cell({"body.axial_rotation": False, **GENTLE}, precision)
+def test_body_without_axial_rotation_tumbles_but_does_not_spin(stepper, device, precision):
+    scene = cell({"body.axial_rotation": False, **GENTLE, **stepper}, precision)
     sim = Simulation(scene, device=device, starts=shaken(scene, seed=3, node=0.001))
     for step in range(1, 6):
         sim.advance(step * 1e-5)
@@ -125,8 +131,8 @@ def test_body_without_axial_rotation_tumbles_but_does_not_spin(device, precision
     assert abs(end.body_angle) < 1e-4 * abs(end_of_run(cell(precision=precision), device).body_angle)
 
 
-def test_anchored_body_keeps_its_pose_to_the_last_bit_while_the_motors_turn(device, precision):
-    scene = cell({"body.anchored": True, **GENTLE}, precision)
+def test_anchored_body_keeps_its_pose_to_the_last_bit_while_the_motors_turn(stepper, device, precision):
+    scene = cell({"body.anchored": True, **GENTLE, **stepper}, precision)
     start = shaken(scene, seed=4, node=0.001)
     end = end_of_run(scene, device, start)
     assert np.array_equal(end.body_position, start.body_position)
@@ -166,8 +172,8 @@ def hook_moment(scene: Scene, state: CellState) -> float:
     return abs(group.hook_twist_factor * group.twist_rigidity / 0.2 * twist)
 
 
-def test_reversed_motors_on_mirrored_flagella_give_the_mirrored_run(device, precision):
-    scene = cell(GENTLE, precision)
+def test_reversed_motors_on_mirrored_flagella_give_the_mirrored_run(stepper, device, precision):
+    scene = cell({**GENTLE, **stepper}, precision)
     mirrored = with_values(scene, {"motor.torque": -3.4, "flagella.intrinsic_curvature": (0.0, 1.3, 2.1)})
     start, mirror = shaken(scene, seed=5, node=0.001, body=0.0), np.array([1.0, -1.0, 1.0])
     image = dataclasses.replace(
@@ -183,6 +189,6 @@ def test_reversed_motors_on_mirrored_flagella_give_the_mirrored_run(device, prec
     assert (run.motor_angle > 0.1).all()
 
 
-def test_each_flagellum_has_its_own_sense_of_rotation(device):
-    end = end_of_run(cell({"flagellum.0.torque": 3.4, "flagellum.1.torque": -1.0}), device)
+def test_each_flagellum_has_its_own_sense_of_rotation(stepper, device):
+    end = end_of_run(cell({"flagellum.0.torque": 3.4, "flagellum.1.torque": -1.0, **stepper}), device)
     assert end.motor_angle[0] > 0.1 and end.motor_angle[1] < -0.1

@@ -75,6 +75,7 @@ def poisoned(what: str, value: float) -> Callable[[np.ndarray, np.ndarray], None
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
 @pytest.mark.parametrize(
     ("change", "kind", "segments"),
     [
@@ -91,8 +92,8 @@ def poisoned(what: str, value: float) -> Callable[[np.ndarray, np.ndarray], None
         (poisoned("director", np.nan), Fault.NOT_FINITE, {3, 4}),
     ],
 )
-def test_a_bad_start_is_named_before_any_step(change, kind, segments, device, precision):
-    scene = cell(precision=precision)
+def test_a_bad_start_is_named_before_any_step(change, kind, segments, stepper, device, precision):
+    scene = cell({"numerics.stepper": stepper}, precision)
     sim = Simulation(scene, device=device, starts=changed(scene, 1, change))
     with pytest.raises(NumericalError) as caught:
         sim.advance(1e-5)

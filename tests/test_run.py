@@ -30,7 +30,8 @@ def test_a_run_leaves_record_movie_scene_and_summary(tmp_path):
             np.testing.assert_array_equal(said["observables"][name], values[-1])
     assert said["status"] == "done" and said["guards"]["violated"] is None
     assert (said["device"], said["precision"], said["stepper"]) == ("cpu", "float64", "implicit")
-    assert said["wall_time"] > 0 and said["rejected_steps"] == 0 and said["evaluations"] > said["steps"]
+    assert said["wall_time"] > 0 and said["rejected_steps"] >= 0
+    assert said["evaluations"] == said["steps"] + said["rejected_steps"]  # one a step
     assert said["versions"].keys() >= {"warpflag", "warp-lang", "python"} and "-march=native" in said["kernel_flags"]
 
 

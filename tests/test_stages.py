@@ -20,7 +20,7 @@ from warpflag.simulation import Simulation
 from warpflag.stages import right_hand_side
 
 FILES = sorted(Path(warpflag_kernels.__file__).parent.glob("*.py"))
-BARE = {"hydrodynamics.mode": "none", "steric.enabled": False, "body.contact": False}
+BARE = {"numerics.stepper": "rkc", "hydrodynamics.mode": "none", "steric.enabled": False, "body.contact": False}
 # A term, the scene without it, and what then is missing: the stage, its modules, the arrays of the state.
 TERMS = {
     "steric": ({"steric.enabled": False}, "steric", {"steric", "steric_measure"}, {"steric_first", "steric_second"}),
@@ -64,6 +64,14 @@ def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypat
             assert (getattr(state, name) is not None) == present, name
 
 
+def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
+    implicit = {"numerics.stepper": "implicit"}
+    solver = {"contacts", "response"}
+    assert stages_of(launches(cell(implicit), monkeypatch)) & solver == solver
+    off = {"steric.enabled": False, "body.contact": False, **implicit}
+    assert not stages_of(launches(cell(off), monkeypatch)) & solver
+
+
 @pytest.mark.parametrize("mode", ["none", "within", "between", "all"])
 def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
     scene = cell({"hydrodynamics.mode": mode})
@@ -94,7 +102,7 @@ def test_a_stepper_brings_only_its_own_kernels(stepper, monkeypatch):
 def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     """In a fresh process: what Warp says that it compiles or loads."""
     scene = tmp_path / "bare.toml"
-    scene.write_text('name = "bare"\n[flagella]\nlength = 0.6\n', encoding="utf-8")
+    scene.write_text('name = "bare"\n[flagella]\nlength = 0.6\n[numerics]\nstepper = "rkc"\n', encoding="utf-8")
     code = (
         "import warp as wp; from warpflag.scene import load; from warpflag.simulation import Simulation; "
         f"scene = load({str(scene)!r}, {[f'{key}={str(value).lower()}' for key, value in BARE.items()]!r}); "

@@ -1,4 +1,4 @@
-"""The command line: `warpflag run`, `check`, `plot`, `export`, `devices`.
+"""The command line: `warpflag run`, `check`, `plot`, `render`, `export`, `devices`.
 
 Exit status: 0 done; 2 bad input, told in one line; 3 a guard stopped the run; 130 interrupted, resumable. Everything
 heavy is imported by the command that needs it.
@@ -15,6 +15,7 @@ from warpflag import __version__
 
 if TYPE_CHECKING:
     from warpflag.scene import Scene
+    from warpflag.usd import Shot
 
 __all__ = ["main"]
 
@@ -62,7 +63,7 @@ def _located(error: Exception, options: argparse.Namespace) -> Exception:
     from warpflag.scene import SceneError
     from warpflag.scene_file import read_overrides
 
-    if isinstance(error, SceneError) and not error.source and options.scene:
+    if isinstance(error, SceneError) and not error.source and getattr(options, "scene", None):
         return error.located(options.scene, read_overrides(options.set))
     return error
 
@@ -80,9 +81,11 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
 
     check = commands.add_parser(
-        "check", help="show what a scene is and requires", description="Shows the resolved scene and what it requires."
+        "check",
+        help="show what a scene is and requires, or what is wrong with a movie",
+        description="Shows the resolved scene and what it requires; of a USD file, what is wrong with it.",
     )
-    check.add_argument("scene", metavar="SCENE.toml", help="the scene to check")
+    check.add_argument("scene", metavar="SCENE.toml", help="the scene to check, or a .usdc, .usda or .usdz file")
     check.set_defaults(command=_check)
 
     for command in (run, check):
@@ -108,15 +111,47 @@ def _parser() -> argparse.ArgumentParser:
     )
     plot.set_defaults(command=_plot)
 
+    render = commands.add_parser(
+        "render",
+        help="draw a run as a picture or a film",
+        description="Draws a run or its movie. A .webp or .gif needs Pillow, an .mp4 ffmpeg (extra render). "
+        "Flagella are drawn with a radius of 0.05 um; the picture says by how much that is too thick.",
+    )
+    render.add_argument("source", metavar="DIR", help="run directory, or a .usdc, .usda or .usdz file")
+    render.add_argument("-o", dest="output", metavar="FILE", required=True, help="ends in .png, .webp, .gif or .mp4")
+    render.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="pixels (default: 1280x720)")
+    render.add_argument(
+        "--times", type=float, nargs="+", default=[], metavar="MS", help="of a picture [ms]; several make a sheet"
+    )
+    render.add_argument("--snapshots", type=int, metavar="N", help="a sheet of N pictures from first to last")
+    render.add_argument("--radius", type=float, default=0.05, metavar="UM", help="least radius of flagella [um]")
+    render.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
+    render.add_argument("--quiet", action="store_true", help="print errors only")
+    render.set_defaults(command=_render)
+
     export = commands.add_parser(
         "export", help="write a record in another format", description="Writes the record of a run in another format."
     )
-    export.add_argument("directory", metavar="DIR", help="run directory")
-    export.add_argument("--to", choices=("usd",), required=True, help="format")
+    export.add_argument("directories", nargs="+", metavar="DIR", help="run directory; several make one USD movie")
+    export.add_argument("--to", choices=("usd", "vtkhdf", "csv"), required=True, help="format")
     export.add_argument(
-        "-o", dest="output", metavar="FILE", help="ends in .usdc, .usda or .usdz (default: movie.usdc in DIR)"
+        "-o",
+        dest="output",
+        metavar="FILE",
+        help="default: movie.usdc, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
     )
+    export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
     export.set_defaults(command=_export)
+
+    for command in (render, export):
+        command.add_argument(
+            "--color", metavar="BY", help="flagellum (default), phase_difference, curvature or steric_force"
+        )
+        command.add_argument("--follow", action="store_true", help="the camera goes with the cell")
+        command.add_argument("--fps", type=float, help="frames per second of the film (default: 50)")
+        command.add_argument(
+            "--slow-down", type=float, metavar="X", help="times slower than the cell (default: a frame per frame)"
+        )
 
     devices = commands.add_parser("devices", help="list the devices of this machine")
     devices.set_defaults(command=_devices)
@@ -144,6 +179,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
+    if options.scene.endswith((".usd", ".usda", ".usdc", ".usdz")):
+        return _check_movie(options.scene)
     scene = _scene(options)
     from warpflag.check import report
     from warpflag.faults import NumericalError
@@ -153,6 +190,14 @@ def _check(options: argparse.Namespace) -> int:
     except NumericalError as error:
         return _say(f"{scene.name}: {error}", STOPPED)
     return DONE
+
+
+def _check_movie(path: str) -> int:
+    from warpflag.usd_check import problems_of
+
+    found = problems_of(path)
+    print("\n".join(found) or f"{path}: plays")
+    return BAD_INPUT if found else DONE
 
 
 def _scene(options: argparse.Namespace) -> Scene:
@@ -176,17 +221,68 @@ def _plot(options: argparse.Namespace) -> int:
     return DONE
 
 
+def _render(options: argparse.Namespace) -> int:
+    from warpflag.render import render
+
+    filmed_anew = options.color or options.follow or options.slow_down
+    render(
+        options.source,
+        options.output,
+        shot=_shot(options) if filmed_anew else None,
+        times=[1e-3 * time for time in options.times],
+        snapshots=options.snapshots,
+        frames_per_second=options.fps,
+        size=options.size,
+        radius=options.radius,
+        device=options.device,
+        quiet=options.quiet,
+    )
+    if not options.quiet:
+        print(options.output)
+    return DONE
+
+
 def _export(options: argparse.Namespace) -> int:
+    from contextlib import ExitStack
     from pathlib import Path
 
+    from warpflag import export, usd
     from warpflag.record import Record
-    from warpflag.usd import write_movie
 
-    path = Path(options.output or Path(options.directory) / "movie.usdc")
-    with Record(options.directory) as record:
-        write_movie(record, path)
+    names = {"usd": "movie.usdc", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
+    path = Path(options.output or Path(options.directories[0]) / names[options.to])
+    if len(options.directories) > 1 and (options.to != "usd" or not options.output):
+        return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
+    with ExitStack() as stack:
+        records = [stack.enter_context(Record(directory)) for directory in options.directories]
+        if options.to == "usd":
+            usd.write_movie(records, path, _shot(options))
+        else:
+            {"vtkhdf": export.write_vtkhdf, "csv": export.write_csv}[options.to](records[0], path)
     print(path)
     return DONE
+
+
+def _shot(options: argparse.Namespace) -> Shot:
+    """How a movie is to be filmed, by what was said of it."""
+    from warpflag.usd import Shot
+
+    said = {
+        "color_by": options.color,
+        "follow": options.follow,
+        "frames_per_second": options.fps,
+        "slow_down": options.slow_down,
+        "clip_frames": getattr(options, "clip_frames", None),
+    }
+    return Shot(**{name: value for name, value in said.items() if value is not None})
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height of "1280x720"."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
+    return int(width), int(height)
 
 
 def _devices(options: argparse.Namespace) -> int:

@@ -35,7 +35,6 @@ STYLE = {
     "ytick.direction": "in",
     "axes.linewidth": 0.6,
     "lines.linewidth": 1.1,
-    "savefig.dpi": 300,
 }
 # Okabe & Ito's colours, told apart by colour-blind readers.
 COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000"]
@@ -91,8 +90,8 @@ def time_series(runs: Sequence[Curves], forces_of: Sequence[str] | None = None) 
         figure, (above, below) = plt.subplots(2, figsize=(COLUMN, 4.7), sharex=True, layout="constrained")
         shown = [k for k, run in enumerate(runs) if forces_of is None or run.label in forces_of]
         panels = (
-            (above, "phase_difference", r"$\langle\theta\rangle$", (0.52, 0.50, 0.45, 0.46)),
-            (below, "bundle_length", r"$l_r$", (0.55, 0.12, 0.42, 0.42)),
+            (above, "phase_difference", r"$\langle\theta\rangle$", (0.52, 0.52, 0.46, 0.45)),
+            (below, "bundle_length", r"$l_r$", (0.60, 0.14, 0.38, 0.35)),
         )
         for axes, name, symbol, place in panels:
             _draw(axes, runs, name)
@@ -105,9 +104,9 @@ def time_series(runs: Sequence[Curves], forces_of: Sequence[str] | None = None) 
             if run.model is not None:
                 below.plot(*run.model, "--", color=COLORS[k % len(COLORS)], linewidth=0.9)
         below.set_xlabel("t (ms)")
-        _legend(figure, above, len(runs))
+        _legend(figure, above)
         for axes, letter in ((above, "(a)"), (below, "(b)")):
-            axes.text(0.015, 0.96, letter, transform=axes.transAxes, va="top")
+            axes.text(-0.14, 1.0, letter, transform=axes.transAxes, va="top", ha="right")
     return figure
 
 
@@ -121,7 +120,7 @@ def comparison(runs: Sequence[Curves], dashed: Sequence[str] = ()) -> Figure:
         figure, axes = plt.subplots(figsize=(TWO_COLUMNS * 0.75, 3.1), layout="constrained")
         _draw(axes, runs, "bundle_length", dashed)
         axes.set(xlabel="t (ms)", ylabel=r"$l_r$", xlim=(0.0, max(run.times[-1] for run in runs)))
-        _legend(figure, axes, len(runs))
+        _legend(figure, axes)
         inset = _inset(axes, (0.62, 0.15, 0.36, 0.40), r"$\langle\theta\rangle$")
         _draw(inset, runs, "phase_difference", dashed)
     return figure
@@ -163,8 +162,10 @@ def snapshots(directory: str | Path, times: Sequence[float], columns: int = 4) -
     return figure
 
 
-def save(figure: Figure, path: str | Path) -> None:
+def save(figure: Figure, path: str | Path, dpi: float = 300) -> None:
     """Writes a figure, the ending of the path says the format (png, pdf, svg, ...), and lets go of it.
+
+    dpi: dots per inch of a format that has them.
 
     Raises OutputError for an unknown format.
     """
@@ -173,7 +174,7 @@ def save(figure: Figure, path: str | Path) -> None:
     if path.suffix.lstrip(".") not in formats:
         raise OutputError(f"{path}: must end in one of .{', .'.join(sorted(formats))}")
     with plt.rc_context(STYLE), whole(path) as temporary:
-        figure.savefig(temporary)
+        figure.savefig(temporary, dpi=dpi)
     plt.close(figure)
 
 
@@ -200,8 +201,8 @@ def _inset(axes: Any, place: tuple[float, float, float, float], y: str) -> Any:
     from matplotlib.patches import Rectangle
 
     left, bottom, width, height = place
-    ground = Rectangle((left - 0.13, bottom - 0.15), width + 0.15, height + 0.18, transform=axes.transAxes)
-    ground.set(facecolor="white", alpha=0.85, edgecolor="none", zorder=4)
+    ground = Rectangle((left - 0.12, bottom - 0.14), width + 0.13, height + 0.16, transform=axes.transAxes)
+    ground.set(facecolor="white", edgecolor="none", zorder=4)
     axes.add_patch(ground)
     inset = axes.inset_axes(place, zorder=5)
     inset.set_xlabel("t (ms)", fontsize=7, labelpad=1)
@@ -211,10 +212,12 @@ def _inset(axes: Any, place: tuple[float, float, float, float], y: str) -> Any:
     return inset
 
 
-def _legend(figure: Figure, axes: Any, count: int) -> None:
-    if count > 1:
-        handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=min(count, 4), handlelength=1.8)
+def _legend(figure: Figure, axes: Any) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) > 1:
+        room = 0.45 + 0.055 * max(map(len, labels))  # inches that an entry takes: handle and 7 point letters
+        columns = min(len(labels), max(1, int(figure.get_figwidth() / room)))
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns, handlelength=1.8)
 
 
 def _strokes(record: Record, frame: int) -> tuple[Array, Array, list[str]]:

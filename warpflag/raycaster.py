@@ -60,7 +60,7 @@ def draw(
     view.screen_top, view.screen_bottom = wp.vec3(*linear(_SCREEN_TOP)), wp.vec3(*linear(_SCREEN_BOTTOM))
     view.vignette, view.shade = 0.12, 0.3
 
-    picture = wp.empty(3 * size[0] * size[1], dtype=wp.uint8, device=device)
+    picture: Any = wp.array(np.empty(3 * size[0] * size[1], np.uint8), dtype=wp.uint8, device=device)
     raycast.cast(capsules, view, picture)
     return picture.numpy().reshape(size[1], size[0], 3)
 

@@ -124,31 +124,38 @@ def render(
     """
     output = Path(output)
     check_writable(output)
+    for name, value in (("radius", radius), ("frames per second", frames_per_second)):
+        if value is not None and not 0 < value < np.inf:
+            raise OutputError(f"{name} {value:g}: must be positive and finite")
     if min(size) < 32 or max(size) > 16384:
         raise OutputError(f"size {size[0]}x{size[1]}: 32 to 16384 pixels a side are allowed")
-    if not 0 < radius < np.inf:
-        raise OutputError(f"radius {radius:g}: must be positive and finite")
     film = _film(Path(source), shot)
     renderer = Renderer(film, size, radius, device)
-    progress = Progress(film.time(film.end), quiet=quiet)
+    if output.suffix == ".png":
+        codes = _snapshot_codes(film, times, snapshots)
+    elif times or snapshots is not None:
+        raise OutputError(f"{output}: times and snapshots are for pictures, .png")
+    rate = frames_per_second or film.frames_per_second
+    if output.suffix != ".png":
+        codes = np.arange(film.start, film.end + 1e-6, film.codes_per_second / rate).tolist()
+    progress = Progress(film.time(codes[-1]), quiet=quiet or len(codes) == 1)
     try:
-        if output.suffix == ".png":
-            codes = [film.code_at(time) for time in times]
-            if snapshots is not None:
-                if snapshots < 1 or codes:
-                    raise OutputError("snapshots: a positive number, without times")
-                codes = np.linspace(film.start, film.end, snapshots).tolist()
-            picture = renderer.sheet(codes, progress) if len(codes) > 1 else renderer.picture((codes or [film.end])[0])
-            write_png(output, picture)
-        else:
-            if times or snapshots is not None:
-                raise OutputError(f"{output}: times and snapshots are for pictures, .png")
-            rate = frames_per_second or film.frames_per_second
-            step = film.codes_per_second / rate
-            codes = np.arange(film.start, film.end + 1e-6, step).tolist()
+        if output.suffix != ".png":
             write_animation(output, renderer.pictures(codes, progress), len(codes), 1.0 / rate)
+        elif len(codes) > 1:
+            write_png(output, renderer.sheet(codes, progress))
+        else:
+            write_png(output, renderer.picture(codes[0]))
     finally:
         progress.close()
+
+
+def _snapshot_codes(film: Film, times: Sequence[float], snapshots: int | None) -> list[float]:
+    if snapshots is None:
+        return [film.code_at(time) for time in times] or [film.end]
+    if snapshots < 1 or times:
+        raise OutputError(f"snapshots {snapshots}: must be positive, and given without times")
+    return np.linspace(film.start, film.end, snapshots).tolist()
 
 
 def _film(source: Path, shot: Shot | None) -> Film:
@@ -195,7 +202,7 @@ def _draw_scale(picture: NDArray[np.uint8], pixel: float, letter: float) -> None
 def _draw_legend(picture: NDArray[np.uint8], film: Film, radius: float, letter: float) -> None:
     """By how much the flagella are thickened, and what the colours mean, in the lower left corner."""
     x, y, small = 1.4 * letter, picture.shape[0] - 1.6 * letter, 0.75 * letter
-    factor = radius / film.thickest_thin()
+    factor = radius / film.thinnest()
     if factor > 1.05:
         draw_text(picture, f"flagella drawn {factor:.2g}x thicker", (x, y), small, _FAINT)
         y -= 2.2 * letter

@@ -168,13 +168,13 @@ class Simulation:
             NumericalError: a guard was violated; the device holds the offending state, frames taken before are sound.
         """
         control, state = self.system.control, self.system.state.data
+        self.prepare()
+        if not self._checked:
+            self._check_start()
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
         if not waiting.any():
             self._raise_fault()
             return
-        self.prepare()
-        if not self._checked:
-            self._check_start()
         control.target.fill_(until)
         state.active.assign(waiting.astype(np.int32))
         control.unfinished.fill_(int(waiting.sum()))
@@ -308,7 +308,6 @@ class Simulation:
         chart.rest.zero_()
         s.data.active.zero_()
         self._checked = True
-        self._raise_fault()
 
     def _raise_fault(self) -> None:
         faults = self.system.control.fault.numpy()

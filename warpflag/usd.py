@@ -9,7 +9,7 @@ film is slower than the cell by the factor in customLayerData; the simulated tim
     /World/Lights
 
 The points have the order of the record's nodes. What outgrows 256 MiB is written as value clips, files of so many
-frames each in the folder NAME_clips beside the movie; a program that opens the movie finds them.
+frames each in the folder NAME.usdc.clips beside the movie; a program that opens the movie finds them.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
@@ -81,7 +81,7 @@ def write_movie(records: Record | Sequence[Record], path: str | Path, shot: Shot
         raise OutputError(f"{path}: a movie must end in {', '.join(SUFFIXES)}")
     film = _Film(records, shot)
     token = uuid4().hex[:8]
-    clips = path.with_name(f"{path.stem}_clips")
+    clips = path.with_name(f"{path.name}.clips")
     if path.suffix != ".usdz" and film.clip_frames < film.frame_count:
         film.write_clips(clips, token)
     else:

@@ -24,7 +24,10 @@ from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.usd_shot import Extent, body_axes
 
-__all__ = ["Cell"]
+__all__ = ["UNDEFINED", "Cell"]
+
+UNDEFINED = -1.0
+"""Raw value of a node at which a quantity is not defined: in a USD file a NaN is a fault."""
 
 _SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
 _SPOKE_WIDTH = 0.07
@@ -43,6 +46,9 @@ class Cell:
 
         self._stage, self._path, self._record, self._scene = stage, path, record, scene
         self.coloring = Coloring(color_by, record, scene)
+        # A few numbers per frame, read once; the nodes are read block by block.
+        self._times, self._motor_angles = record.times, record.motor_angle
+        self._positions, self._orientations = record.body_position, record.body_orientation
         self.animated: dict[Any, Any] = {}
         self.xform = UsdGeom.Xform.Define(stage, path)
         self.prim = self.xform.GetPrim()
@@ -61,39 +67,36 @@ class Cell:
         """Attribute path, frame and value of everything that changes, for a block of frames; `extent` grows by them."""
         from pxr import Gf, Vt
 
-        record, radius = self._record, self._record.filament_radius
-        positions = record.positions[frames]
-        turned = np.degrees(record.motor_angle[frames])
+        radius = self._record.filament_radius
+        positions = self._record.positions[frames]
+        turned = np.degrees(self._motor_angles[frames])
         colors = values = None
         if self.coloring.changes:
             values = self.coloring.values(positions, frames)
-            colors = self.coloring.colors(values)
+            colors, values = self.coloring.colors(values), np.nan_to_num(values, nan=UNDEFINED).astype(np.float32)
         points = positions.astype(np.float32)
         low, high = points.min(axis=1) - np.float32(radius), points.max(axis=1) + np.float32(radius)
         extent.add(frames, positions, radius)
-        extent.add(frames, self._body_ends(frames), 0.5 * record.body_width)
-        poses = zip(record.body_position[frames], record.body_orientation[frames], strict=True)
-        times = record.times[frames]
-        for i, (position, (x, y, z, w)) in enumerate(poses):
-            frame = frames.start + i
-            yield self._time, frame, float(times[i])
+        extent.add(frames, self._body_ends(frames), 0.5 * self._record.body_width)
+        for i, frame in enumerate(range(frames.start, frames.stop)):
+            yield self._time, frame, float(self._times[frame])
             yield self._points, frame, Vt.Vec3fArray.FromNumpy(points[i])
             yield self._extent, frame, Vt.Vec3fArray.FromNumpy(np.stack([low[i], high[i]]))
             if colors is not None and values is not None:
                 yield self._colors, frame, Vt.Vec3fArray.FromNumpy(colors[i])
-                yield self._values, frame, Vt.FloatArray.FromNumpy(values[i].astype(np.float32))
+                yield self._values, frame, Vt.FloatArray.FromNumpy(values[i])
+            x, y, z, w = self._orientations[frame].tolist()
             for translate, orient in self._poses:
-                yield translate, frame, Gf.Vec3d(*map(float, position))
-                yield orient, frame, Gf.Quatd(float(w), float(x), float(y), float(z))
+                yield translate, frame, Gf.Vec3d(*self._positions[frame].tolist())
+                yield orient, frame, Gf.Quatd(w, x, y, z)
             for turn, angle in zip(self._turns, turned[i].tolist(), strict=True):
                 yield turn, frame, angle
 
     def _body_ends(self, frames: slice) -> NDArray[np.float64]:
         """Middles of the body's round ends [um], shape [frame, 2, 3]."""
-        record = self._record
-        half = 0.5 * (record.body_length - record.body_width)
-        axes = np.stack([body_axes(orientation)[2] for orientation in record.body_orientation[frames]])
-        return record.body_position[frames][:, None] + half * axes[:, None] * np.array([-1.0, 1.0])[:, None]
+        half = 0.5 * (self._record.body_length - self._record.body_width)
+        axes = np.stack([body_axes(orientation)[2] for orientation in self._orientations[frames]])
+        return self._positions[frames][:, None] + half * axes[:, None] * np.array([[-1.0], [1.0]])
 
     def _animate(self, attribute: Any) -> Any:
         self.animated[attribute.GetPath()] = attribute.GetTypeName()
@@ -153,12 +156,12 @@ class Cell:
 
         record = self._record
         first = record.first_node[:-1]
-        to_body = body_axes(record.body_orientation[0])  # rows: the body's axes in the lab
-        anchors = (record.positions[0][first] - record.body_position[0]) @ to_body.T
+        to_body = body_axes(self._orientations[0])  # rows: the body's axes in the lab
+        anchors = (record.positions[0][first] - self._positions[0]) @ to_body.T
         e1, axes = record.directors[0][first] @ to_body.T, _motor_axes(self._scene)
         turns = []
         for k, (anchor, director, axis) in enumerate(zip(anchors, e1, axes, strict=True)):
-            back = record.motor_angle[0][k]  # the angle at the first frame need not be 0
+            back = self._motor_angles[0, k]  # the angle at the first frame need not be 0
             director = np.cos(back) * director - np.sin(back) * np.cross(axis, director)
             tripod = Gf.Matrix3d(*np.stack([director, np.cross(axis, director), axis]).ravel().tolist())
             motor = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Motors/Motor_{k}")

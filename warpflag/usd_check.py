@@ -13,7 +13,19 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["problems"]
+from warpflag.usd_read import opened
+
+__all__ = ["problems", "problems_of"]
+
+
+def problems_of(path: str) -> list[str]:
+    """What is wrong with a USD file, by these checks and by those that come with USD."""
+    from pxr import UsdValidation
+
+    stage = opened(path)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    findings = UsdValidation.ValidationContext(validators).Validate(stage)
+    return [f"{finding.GetName()}: {finding.GetMessage()}" for finding in findings] + problems(stage)
 
 
 def problems(stage: Any) -> list[str]:

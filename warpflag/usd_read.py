@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from warpflag.output import OutputError
 
-__all__ = ["Camera", "Film", "Rods"]
+__all__ = ["Camera", "Film", "Rods", "opened"]
 
 Array = NDArray[np.float64]
 
@@ -54,6 +55,16 @@ class Camera:
     focus: float
 
 
+def opened(path: str | Path) -> Any:
+    """The stage of a USD file. Raises OutputError where it can't be read."""
+    from pxr import Tf, Usd
+
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException:
+        raise OutputError(f"{path}: not a readable USD file") from None
+
+
 class Film:
     """The movie of a stage or of a .usd, .usda, .usdc or .usdz file.
 
@@ -62,13 +73,10 @@ class Film:
     """
 
     def __init__(self, source: Any):
-        from pxr import Tf, Usd, UsdGeom, UsdLux
+        from pxr import UsdGeom, UsdLux
 
-        name = str(source) if isinstance(source, str | Path) else "the stage"
-        try:
-            stage = Usd.Stage.Open(name) if isinstance(source, str | Path) else source
-        except Tf.ErrorException as error:
-            raise OutputError(f"{name}: not a readable USD file") from error
+        is_file = isinstance(source, str | Path)
+        name, stage = (source, opened(source)) if is_file else ("the stage", source)
         prims = list(stage.Traverse())
         cameras, lights, cells = (
             [prim for prim in prims if belongs(prim)]
@@ -93,12 +101,15 @@ class Film:
 
     def code_at(self, time: float) -> float:
         """The time code of a simulated time [s], or of the nearest one that the movie has."""
-        codes = np.arange(self.start, self.end + 1)
-        return float(np.interp(time, [self.time(code) for code in codes], codes))
+        return float(np.interp(time, self._times, np.arange(self.start, self.end + 1)))
 
-    def thickest_thin(self) -> float:
-        """The radius of the flagella as the movie has it [um]."""
-        return min((0.5 * curves.GetWidthsAttr().Get()[0] for curves in self._curves), default=0.0)
+    @cached_property
+    def _times(self) -> list[float]:
+        return [self.time(code) for code in np.arange(self.start, self.end + 1)]
+
+    def thinnest(self) -> float:
+        """The radius of the flagella as the movie has it, its thinnest curves [um]."""
+        return min(0.5 * curves.GetWidthsAttr().Get()[0] for curves in self._curves)
 
     def camera(self, code: float) -> Camera:
         """The camera."""

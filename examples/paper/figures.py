@@ -47,8 +47,8 @@ def figure_3(runs: Path, length: int) -> Figure:
             model = zipper.measured(record, times[0], times[-1])
         fitted = zipper.fit(model, times - times[0], lengths, "phase_velocity").zipper
         curve = 1e3 * times, zipper.bundle_length(fitted, times - times[0])
-        curves.append(figures.read(directory, rf"$\Phi = {angle}°$", curve))
-    return figures.time_series(curves, forces_of=[rf"$\Phi = {angle}°$" for angle in (44, 90)])
+        curves.append(figures.read(directory, f"Φ = {angle}°", curve))
+    return figures.time_series(curves, forces_of=[f"Φ = {angle}°" for angle in (44, 90)])
 
 
 def figure_4(runs: Path, torque: str) -> Figure:
@@ -86,7 +86,7 @@ def main() -> None:
         ),
     }
     for name, figure in drawn.items():
-        figures.save(figure, output / f"{name}.png")
+        figures.save(figure, output / f"{name}.png", dpi=200)
     text = table.markdown(runs, {title: list(group) for title, group in groups.items()})
     (HERE / "table.md").write_text(text, encoding="utf-8")
     print(f"{output}, {HERE / 'table.md'}")

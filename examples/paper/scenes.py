@@ -73,7 +73,6 @@ def choices() -> dict[str, Scene]:
     for angle in (23, 90):
         name = f"phi{angle}-no-bearing-torque"
         runs[name] = scene(name, 0.030, {"motor.bearing_torque": False}, angle)
-        runs[f"phi{angle}-T2"] = scene(f"phi{angle}-T2", 0.040, {"motor.torque": 2.0}, angle)
     runs["check-accuracy"] = scene("check-accuracy", 0.015, {"numerics.accuracy": 1e-3})
     runs["check-rkc"] = scene("check-rkc", 0.015, {"numerics.stepper": "rkc"})
     return runs
@@ -82,8 +81,8 @@ def choices() -> dict[str, Scene]:
 def torques() -> dict[str, Scene]:
     """Motor torques below the paper's, down to those that give its rates; long runs, for zipping is slow there."""
     runs = {}
-    for torque, duration in ((1.0, 0.060), (0.38, 0.100), (0.34, 0.300)):
-        for angle in (23, 90) if torque == 1.0 else (23,):
+    for torque, duration in ((2.0, 0.040), (1.0, 0.060), (0.5, 0.200), (0.34, 0.300)):
+        for angle in {2.0: (90,), 1.0: (23, 90)}.get(torque, (23,)):
             name = f"phi{angle}-T{torque:g}"
             runs[name] = scene(name, duration, {"motor.torque": torque}, angle, FRAME * 3.4 / torque)
     return runs

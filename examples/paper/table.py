@@ -39,6 +39,7 @@ def markdown(runs: Path, groups: dict[str, list[str]]) -> str:
     lines = ["# Measured", "", NOTES]
     for title, names in groups.items():
         lines += [f"## {title}", "", *_table([COLUMNS, UNITS], [_row(runs / name) for name in names]), ""]
+    lines += _main_run(runs / "L8-phi90")
     return "\n".join([*lines, *_zipper(runs, next(iter(groups.values())))]) + "\n"
 
 
@@ -66,6 +67,27 @@ def _row(directory: Path) -> list[str]:
             f"{swimming.body_rate:.1f}",
             f"{swimming.net_speed:.0f}",
         ]
+
+
+def _main_run(directory: Path) -> list[str]:
+    """Straightness of <theta> and l_r, and the fall of f_c."""
+    with Record(directory) as record:
+        times, force = 1e3 * record.times, record.observables["steric_force_density"]
+        theta, lengths = record.observables["phase_difference"], recorded.bundle_lengths(record, STRAY)
+    zipped = 1e3 * zip_time(times / 1e3, lengths, hold=2.5e-4)
+    lines = [f"## {directory.name}: is it linear?", ""]
+    for name, values, start, stop in (("⟨θ⟩", theta, 7.0, 13.5), ("l_r", lengths, 4.0, zipped)):
+        window = (times >= start) & (times <= stop)
+        slope, offset = np.polyfit(times[window], values[window], 1)
+        rest = values[window] - offset - slope * times[window]
+        share = 1 - rest.var() / values[window].var()
+        lines.append(
+            f"- {name} from {start:g} to {stop:g} ms: {slope:+.4f} per ms, {100 * share:.1f} % of its variance"
+        )
+    low, fallen = int(theta.argmin()), (times > times[force.argmax()]) & (force < force.max() / 10)
+    lines.append(f"- ⟨θ⟩ first below 0.05 at {times[np.argmax(theta < 0.05)]:.2f} ms, least at {times[low]:.2f} ms")
+    lines.append(f"- f_c below a tenth of its peak {times[np.argmax(fallen)] - zipped:.2f} ms after the zip")
+    return [*lines, ""]
 
 
 def _zipper(runs: Path, names: list[str]) -> list[str]:

@@ -43,7 +43,7 @@ def struct(p: Precision) -> Any:
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, _vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
-    closest_parameters = steric.functions(p).closest_parameters
+    closest_parameters, next_near = steric.functions(p).closest_parameters, steric.functions(p).next_near
     reach_factor = real(steric.CUTOFF + MARGIN)
     module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
 
@@ -67,7 +67,8 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     q2 = pose.position[j]
                     away = middle - real(0.5) * (p2 + q2)
                     near = own_reach + real(0.5) * pose.length[j]
-                    if wp.dot(away, away) < near * near:
+                    distance = wp.length(away)
+                    if distance < near:
                         st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
                         apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
                         r = wp.length(apart)
@@ -84,7 +85,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 else:
                                     contacts.normal[i] = wp.normalize(wp.cross(q1 - p1, q2 - p2))
                             found += 1
-                    j += 1
+                    j = next_near(pose.length, j, model.first_node[other + 1], distance, own_reach)
                 other += 1
         if wp.static(body):
             axis = pose.body_axis[c]

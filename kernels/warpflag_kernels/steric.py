@@ -83,8 +83,27 @@ def functions(p: Precision) -> SimpleNamespace:
             s = wp.clamp((b - c) / a, zero, one)
         return vec2(s, t)
 
+    @wp.func(module=p.module("steric_functions"))
+    def next_near(length: wp.array(dtype=real), j: wp.int32, end: wp.int32, distance: real, reach: real):
+        """The next segment of a chain that can be near: along it, midpoints move on by no more than the lengths.
+
+        Args:
+            distance: of the midpoint of segment j [um].
+            reach: how near a segment must come, its own half length not counted [um].
+        """
+        bound = distance - real(0.5) * length[j]
+        i = j + 1
+        while i < end and bound - length[i] > reach:  # false for NaN
+            bound -= length[i]
+            i += 1
+        return i
+
     return SimpleNamespace(
-        steric_force=steric_force, steric_stiffness=steric_stiffness, closest_parameters=closest_parameters, vec2=vec2
+        next_near=next_near,
+        steric_force=steric_force,
+        steric_stiffness=steric_stiffness,
+        closest_parameters=closest_parameters,
+        vec2=vec2,
     )
 
 
@@ -92,13 +111,12 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    steric_force, closest_parameters = functions(p).steric_force, functions(p).closest_parameters
+    f = functions(p)
+    steric_force, closest_parameters, next_near = f.steric_force, f.closest_parameters, f.next_near
     cutoff = real(CUTOFF)
 
     @wp.func(module=p.module("steric"))
-    def own_pairs(
-        model: Model, state: State, e: wp.int32, begin: wp.int32, end: wp.int32, strength: real, diameter: real
-    ):
+    def own_pairs(state: State, e: wp.int32, begin: wp.int32, end: wp.int32, strength: real, diameter: real):
         """Forces on the first and second node of segment e from segments [begin, end), and the sum of |F|."""
         first = vec3(real(0.0))
         second = vec3(real(0.0))
@@ -107,7 +125,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
         q1 = state.position[e]
         middle = real(0.5) * (p1 + q1)
         reach = real(0.5) * state.length[e] + cutoff * diameter
-        skip = real(0.8) / model.segment_length[model.flagellum_of[begin]]  # room for segments stretched by a quarter
         j = begin
         while j < end:
             p2 = state.position[j - 1]
@@ -136,10 +153,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
                         normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
                     first += ((real(1.0) - s) * magnitude) * normal
                     second += (s * magnitude) * normal
-            # Along the chain, midpoints move on by a segment at a time: the next ones can't be near yet.
-            j += 1
-            if distance > near:  # false for NaN
-                j += wp.int32(wp.min((distance - near) * skip, real(10000.0)))
+            j = next_near(state.length, j, end, distance, reach)
         return first, second, total
 
     @wp.func(module=p.module("steric"))
@@ -157,7 +171,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             if other != k:
                 begin = model.first_node[other] + 1
                 end = model.first_node[other + 1]
-                on_first, on_second, sum_of_magnitudes = own_pairs(model, state, e, begin, end, strength, diameter)
+                on_first, on_second, sum_of_magnitudes = own_pairs(state, e, begin, end, strength, diameter)
                 first += on_first
                 second += on_second
                 total += sum_of_magnitudes
