@@ -202,7 +202,7 @@ def _inset(axes: Any, place: tuple[float, float, float, float], y: str) -> Any:
 
     left, bottom, width, height = place
     ground = Rectangle((left - 0.12, bottom - 0.14), width + 0.13, height + 0.16, transform=axes.transAxes)
-    ground.set(facecolor="white", edgecolor="none", zorder=4)
+    ground.set(facecolor="white", edgecolor="none", zorder=2.4)  # above lines, below the frame
     axes.add_patch(ground)
     inset = axes.inset_axes(place, zorder=5)
     inset.set_xlabel("t (ms)", fontsize=7, labelpad=1)
@@ -215,7 +215,7 @@ def _inset(axes: Any, place: tuple[float, float, float, float], y: str) -> Any:
 def _legend(figure: Figure, axes: Any) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if len(labels) > 1:
-        room = 0.45 + 0.055 * max(map(len, labels))  # inches that an entry takes: handle and 7 point letters
+        room = 0.45 + 0.05 * max(map(len, labels))  # inches that an entry takes: handle and 7 point letters
         columns = min(len(labels), max(1, int(figure.get_figwidth() / room)))
         figure.legend(handles, labels, loc="outside upper center", ncols=columns, handlelength=1.8)
 

@@ -129,18 +129,19 @@ def render(
             raise OutputError(f"{name} {value:g}: must be positive and finite")
     if min(size) < 32 or max(size) > 16384:
         raise OutputError(f"size {size[0]}x{size[1]}: 32 to 16384 pixels a side are allowed")
+    is_film = output.suffix != ".png"
+    if is_film and (times or snapshots is not None):
+        raise OutputError(f"{output}: times and snapshots are for pictures, .png")
     film = _film(Path(source), shot)
     renderer = Renderer(film, size, radius, device)
-    if output.suffix == ".png":
-        codes = _snapshot_codes(film, times, snapshots)
-    elif times or snapshots is not None:
-        raise OutputError(f"{output}: times and snapshots are for pictures, .png")
     rate = frames_per_second or film.frames_per_second
-    if output.suffix != ".png":
+    if is_film:
         codes = np.arange(film.start, film.end + 1e-6, film.codes_per_second / rate).tolist()
+    else:
+        codes = _snapshot_codes(film, times, snapshots)
     progress = Progress(film.time(codes[-1]), quiet=quiet or len(codes) == 1)
     try:
-        if output.suffix != ".png":
+        if is_film:
             write_animation(output, renderer.pictures(codes, progress), len(codes), 1.0 / rate)
         elif len(codes) > 1:
             write_png(output, renderer.sheet(codes, progress))

@@ -86,7 +86,7 @@ def main() -> None:
         ),
     }
     for name, figure in drawn.items():
-        figures.save(figure, output / f"{name}.png", dpi=200)
+        figures.save(figure, output / f"{name}.png", dpi=180)
     text = table.markdown(runs, {title: list(group) for title, group in groups.items()})
     (HERE / "table.md").write_text(text, encoding="utf-8")
     print(f"{output}, {HERE / 'table.md'}")

@@ -23,6 +23,7 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 GROUP = 8
 NEWTON_ITERATIONS = 60
 HALVINGS = 8
+NEAR_FIELD = 0.6  # of a contact's pair of forces in the columns [um]
 # Of a gap, in units of sigma: where it only leads to the pose at which the gaps are measured again, and there.
 ROUGH, FINE = 1.0e-3, 1.0e-5
 
@@ -70,6 +71,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
     module = p.module("response", pairs)
     group = wp.constant(GROUP)
+    near_field = wp.constant(real(NEAR_FIELD))
     iterations, halvings = wp.constant(NEWTON_ITERATIONS), wp.constant(HALVINGS)
     infinite = wp.constant(real(3.0e38))
 
@@ -151,8 +153,13 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                         elif oth - 1 == e:
                             own -= (real(1.0) - contacts_in.at_other[i]) * n
                     if wp.static(pairs != "none"):
-                        v = flow(model, state, c, e, seg, s * n)
-                        if oth >= 0:
+                        v = vec3(real(0.0))
+                        # The two sides' opposite forces cancel at a distance; the defect correction adds what is left.
+                        away = state.position[e] - state.position[seg]
+                        near = oth < 0 or wp.dot(away, away) < near_field * near_field
+                        if near:
+                            v = flow(model, state, c, e, seg, s * n)
+                        if near and oth >= 0:
                             r = contacts_in.at_other[i]
                             v += flow(model, state, c, e, seg - 1, (real(1.0) - s) * n)
                             v -= flow(model, state, c, e, oth, r * n)
@@ -361,6 +368,8 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             return
         i = contacts_in.first[c] + index
         response.free_gap[i] = contacts_in.gap[i] + gap_change(model, state, contacts_in, i, start)
+        if index == 0:
+            response.closed_count[c] = -1
         n = extended(contacts_in.normal[i])
         s = contacts_in.at[i]
         r = contacts_in.at_other[i]
@@ -554,9 +563,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             i += 1
         worst = evaluate(response, strength, diameter, first, entry, count)
         iteration = int(0)
-        closed = int(-1)
+        closed = response.closed_count[c]  # -1: no factor yet of these contacts
+        stalled = closed < 0
         while worst > tolerance and iteration < iterations:
-            closed = factorise_closed(response, strength, diameter, first, entry, count)
+            # An old factor serves as long as it brings the residual down quickly.
+            if stalled:
+                closed = factorise_closed(response, strength, diameter, first, entry, count)
             i = int(0)
             while i < closed:
                 response.change[first + i] = -response.residual[first + response.closed[first + i]]
@@ -591,6 +603,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                     i += 1
                 worst = evaluate(response, strength, diameter, first, entry, count)
                 halving += 1
+            stalled = worst > real(0.3) * before
             iteration += 1
         if not (worst <= tolerance):
             response.failed[c] = 1
