@@ -34,7 +34,14 @@ def test_scenes_of_the_figures():
     assert not ablations["T2-no-translation"].body.translation
     changed = with_values(ablations["T3.4-standard"], {"body.anchored": True, "name": "T3.4-anchored"})
     assert changed == ablations["T3.4-anchored"]
-    groups = (opening, ablations, scenes.choices(), scenes.torques(), scenes.printed_mobility())
+    groups = (
+        opening,
+        ablations,
+        scenes.choices(),
+        scenes.torques(),
+        scenes.printed_mobility(),
+        scenes.continued(Path()),
+    )
     names = [name for group in groups for name in group]
     assert len(set(names)) == len(names)
     for group in groups:
@@ -74,7 +81,9 @@ def test_mobility_is_the_one_of_the_model():
 
 def test_table_of_a_run(tmp_path):
     made = Zipping(tmp_path)
+    (tmp_path / "summary.json").write_text('{"status": "stopped", "time": 0.0081}')
     row = dict(zip(table.COLUMNS, table._row(tmp_path), strict=True))
+    assert row["run"] == f"{tmp_path.name} (stopped at 8.10 ms)"
     assert row["zip, held"] == "7.00"  # the front reaches the last node when 0.4 + 0.1 (t - 1 ms) = 1
     assert (row["motor"], row["body"], row["speed"]) == ("366", f"{made.body_rate:.1f}", f"{made.body_speed:.0f}")
     assert (row["f_c peak"], row["at"], row["contact"]) == ("1.01", "8.00", "0.00")

@@ -46,7 +46,7 @@ def problems(stage: Any) -> list[str]:
 
 
 def _stage_problems(stage: Any) -> list[str]:
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdUtils
 
     found = []
     root = stage.GetRootLayer()
@@ -61,8 +61,10 @@ def _stage_problems(stage: Any) -> list[str]:
         found.append("there is no default prim")
     if not any(prim.IsA(UsdGeom.Camera) for prim in stage.Traverse()):
         found.append("there is no camera")
-    missing = [path for path in root.GetCompositionAssetDependencies() if not root.ComputeAbsolutePath(path)]
-    return found + [f"{path}: refers to a file that is not there" for path in missing]
+    if not root.anonymous:
+        _layers, _assets, missing = UsdUtils.ComputeAllDependencies(root.identifier)
+        found += [f"{path}: is referred to and not there" for path in missing]
+    return found
 
 
 def _attribute_problems(attribute: Any, stage: Any) -> list[str]:

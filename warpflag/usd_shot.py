@@ -45,12 +45,12 @@ def view_axes(orientation: Array) -> Array:
 
 
 def steady_path(centres: Array) -> Array:
-    """A path without the wobble, shape [frame, 3]: the moving average over a tenth of the frames.
+    """A path without the wobble, shape [frame, 3]: the moving average over a quarter of the frames.
 
     Both ends are continued by their mirror image through the end point, which keeps a straight path as it is.
     """
     centres = np.asarray(centres, float)
-    half = len(centres) // 20
+    half = len(centres) // 8
     if half == 0:
         return centres
     before = 2.0 * centres[0] - centres[half:0:-1]

@@ -71,7 +71,8 @@ def main() -> None:
         "The mobility as printed": scenes.printed_mobility(),
     }
     run_missing({name: scene for group in groups.values() for name, scene in group.items()}, runs, options.processes)
-    run_missing(scenes.closely(runs), runs, options.processes)
+    groups["Continued from others"] = scenes.continued(runs)
+    run_missing(groups["Continued from others"], runs, options.processes)
 
     output = HERE / "figures"
     output.mkdir(exist_ok=True)

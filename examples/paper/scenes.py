@@ -75,6 +75,8 @@ def choices() -> dict[str, Scene]:
         runs[name] = scene(name, 0.030, {"motor.bearing_torque": False}, angle)
     runs["check-accuracy"] = scene("check-accuracy", 0.015, {"numerics.accuracy": 1e-3})
     runs["check-rkc"] = scene("check-rkc", 0.015, {"numerics.stepper": "rkc"})
+    accurate = {"numerics.accuracy": 1e-3, **ABLATIONS["no-axial-rotation"]}
+    runs["check-no-axial-rotation"] = scene("check-no-axial-rotation", 0.030, accurate)
     return runs
 
 
@@ -93,21 +95,31 @@ BURST = 5.2e-3
 
 
 def printed_mobility() -> dict[str, Scene]:
-    """The paper's pair radius against the one that keeps the mobility positive definite; explicit steps of 1 us."""
-    explicit = {"numerics.stepper": "rkc", "numerics.time_step": 1e-6}
-    modes = {"printed": "as_printed", "derived": "all"}
-    return {name: scene(name, BURST, {"hydrodynamics.mode": mode, **explicit}) for name, mode in modes.items()}
-
-
-def closely(runs: Path) -> dict[str, Scene]:
-    """The same two, from the last frame of their records in the directory `runs` on, frame by microsecond."""
-    near = {"duration": 8e-5, "frames": 80}
+    """The paper's pair radius against the one that keeps the mobility positive definite, in steps of 1 us; others."""
+    steps = {"numerics.stepper": "rkc", "numerics.time_step": 1e-6}
+    printed = {"hydrodynamics.mode": "as_printed"}
     return {
-        f"{name}-closely": with_values(base, {**near, "name": f"{name}-closely", "start.record": str(runs / name)})
-        for name, base in printed_mobility().items()
+        "printed": scene("printed", BURST, {**printed, **steps}),
+        "derived": scene("derived", BURST, steps),
+        "printed-2us": scene("printed-2us", 0.008, {**printed, **steps, "numerics.time_step": 2e-6}),
+        "printed-implicit": scene("printed-implicit", 0.008, printed),
     }
 
 
+def continued(runs: Path) -> dict[str, Scene]:
+    """Runs from the last frame of others, which are in the directory `runs`.
+
+    The burst microsecond by microsecond, and a finished bundle with motors so weak that it would take long to form.
+    """
+    near = {"duration": 8e-5, "frames": 80}
+    weak = {"motor.torque": 0.5, "start.record": str(runs / "T2-standard")}
+    found = {"bundle-T0.5": scene("bundle-T0.5", 0.060, weak, frame=2e-4)}
+    for name in ("printed", "derived"):
+        there = {**near, "name": f"{name}-closely", "start.record": str(runs / name)}
+        found[f"{name}-closely"] = with_values(printed_mobility()[name], there)
+    return found
+
+
 if __name__ == "__main__":
-    for runs in (figure_3(), figure_4(), choices(), torques(), printed_mobility()):
-        print("\n".join(f"{name:30s} {1e3 * run.duration:5.0f} ms" for name, run in runs.items()), end="\n\n")
+    for runs in (figure_3(), figure_4(), choices(), torques(), printed_mobility(), continued(Path("runs"))):
+        print("\n".join(f"{name:30s} {1e3 * run.duration:7.2f} ms" for name, run in runs.items()), end="\n\n")

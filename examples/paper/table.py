@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def markdown(runs: Path, groups: dict[str, list[str]]) -> str:
     lines = ["# Measured", "", NOTES]
     for title, names in groups.items():
         lines += [f"## {title}", "", *_table([COLUMNS, UNITS], [_row(runs / name) for name in names]), ""]
-    lines += _main_run(runs / "L8-phi90")
+    lines += [*_main_run(runs / "L8-phi90"), *_checks(runs)]
     return "\n".join([*lines, *_zipper(runs, next(iter(groups.values())))]) + "\n"
 
 
@@ -50,9 +51,11 @@ def _row(directory: Path) -> list[str]:
             measured[name] for name in ("phase_difference", "bundle_length", "steric_force_density")
         )
         swimming = recorded.swimming(record)
+        summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        stopped = f" (stopped at {1e3 * summary['time']:.2f} ms)" if summary["status"] == "stopped" else ""
         touched, peak = force > 0.0, int(force.argmax())
         return [
-            directory.name,
+            directory.name + stopped,
             f"{theta[0]:.2f}",
             _ms(times[np.argmax(theta < 0.15)] if (theta < 0.15).any() else np.nan),
             f"{theta.min():.3f}",
@@ -87,6 +90,25 @@ def _main_run(directory: Path) -> list[str]:
     low, fallen = int(theta.argmin()), (times > times[force.argmax()]) & (force < force.max() / 10)
     lines.append(f"- ⟨θ⟩ first below 0.05 at {times[np.argmax(theta < 0.05)]:.2f} ms, least at {times[low]:.2f} ms")
     lines.append(f"- f_c below a tenth of its peak {times[np.argmax(fallen)] - zipped:.2f} ms after the zip")
+    return [*lines, ""]
+
+
+def _checks(runs: Path) -> list[str]:
+    """Steppers against each other, f_c by its rules, and where the work of the motors goes."""
+    lines = ["## Checks on the standard run", ""]
+    with Record(runs / "L6-phi23") as record, Record(runs / "check-rkc") as other:
+        until = int(np.searchsorted(record.times, 0.013 - 1e-9)) + 1
+        apart = np.linalg.norm(record.positions[:until] - other.positions[:until], axis=-1).max()
+        lines.append(f"- nodes of the implicit run against `check-rkc` to 13 ms: at most {apart:.3f} µm apart")
+        peaks = [
+            f"{recorded.steric_force_densities(record, rule).max():.2f} ({rule})" for rule in ("pairs", "nodes", "net")
+        ]
+        lines.append(f"- peak of f_c by rule of counting: {', '.join(peaks)} pN/µm")
+        last = recorded.swimming(record)
+        lines.append(
+            f"- motors work {last.motor_power:.0f} pN µm/s, {last.body_power:.0f} of it in the body's drag, "
+            f"{last.stored_power:.0f} stored; thrust {last.thrust:.2f} pN"
+        )
     return [*lines, ""]
 
 

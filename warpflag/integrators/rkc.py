@@ -66,7 +66,7 @@ class RkcStepper:
         r.error = zeros(flagella, p.real)
         self.data = r
         fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
-        accuracies = [0.0 if f else s.numerics.accuracy for f, s in zip(fixed, scenes, strict=True)]
+        accuracies = [0.0 if f else s.numerics.accuracy or 0.0 for f, s in zip(fixed, scenes, strict=True)]
         self.steps = build_step_control(accuracies, device)
         longest = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
         longest = [step if f else LONGEST_STEP for f, step in zip(fixed, longest, strict=True)]

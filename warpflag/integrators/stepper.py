@@ -31,8 +31,8 @@ FIRST_STEP = 1.0e-8
 """First step under control after a start, when nothing is known of the motion yet [s]."""
 
 
-def build_step_control(accuracies: Sequence[float], device: Any) -> StepControl:
-    """Step control of every cell.
+def build_step_control(accuracies: Sequence[float], device: Any) -> Any:
+    """The struct `StepControl` of every cell.
 
     Args:
         accuracies: node error per simulated time [um/ms]; 0 for a fixed step.
@@ -45,7 +45,7 @@ def build_step_control(accuracies: Sequence[float], device: Any) -> StepControl:
     return c
 
 
-def restart_step_control(c: StepControl, fixed_start: np.ndarray) -> None:
+def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
     c.error_sum.zero_()
     c.error_time.zero_()
