@@ -131,7 +131,7 @@ def test_phase_difference_is_with_the_nearest_flagellum(tmp_path):
 
 
 def test_phase_difference_is_undefined_without_a_partner():
-    positions, first_node = crossed(0.1)
+    positions, _ = crossed(0.1)
     longer = np.concatenate([positions, positions[:, -1:] + 0.2], axis=1)
     directors = np.broadcast_to([0.0, 0.0, 1.0], longer.shape)
     theta = nearest_phase_difference(longer, directors, np.array([0, 3, 7]))

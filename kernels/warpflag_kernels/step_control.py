@@ -17,7 +17,8 @@ LARGEST_GROWTH = 1.9  # of the step from one to the next; variable-step BDF2 is 
 REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]
-MOST_RETRIES = 3  # for an estimate: a jump of the velocity keeps its rate however short the step
+JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
+SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below
 ROUND_OFF = {"float64": 1.0e-14, "float32": 5.0e-6}  # of an error estimate [um]
 SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be taken here ends the cell's run
 
@@ -31,7 +32,7 @@ class StepControl:
     error_sum: wp.array(dtype=wp.float64)  # fading sum of dt log(error/dt^3)
     error_time: wp.array(dtype=wp.float64)  # fading sum of dt [s]
     rejected: wp.array(dtype=wp.int32)  # steps taken again so far
-    retries: wp.array(dtype=wp.int32)  # of the present step, for its estimate
+    refused_error: wp.array(dtype=wp.float64)  # estimate of the last attempt, if it was refused for it; else 0 [um]
 
 
 @functools.cache
@@ -41,7 +42,7 @@ def functions(p: Precision) -> SimpleNamespace:
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
-    tiny, most_retries = wp.constant(wp.float64(1.0e-12)), wp.constant(wp.int32(MOST_RETRIES))
+    tiny, jump, shortest = (wp.constant(wp.float64(x)) for x in (1.0e-12, JUMP, SHORTEST_STEP))
 
     @wp.func(module=module)
     def accept(control: StepControl, c: wp.int32, dt: wp.float64, error: wp.float64, sound: wp.bool, known: wp.bool):
@@ -56,18 +57,21 @@ def functions(p: Precision) -> SimpleNamespace:
         good = sound
         tolerance = control.tolerance[c]
         if tolerance > wp.float64(0.0) and known:
-            good = sound and (error < refused * tolerance * dt or control.retries[c] == most_retries)
-            if good:
+            # A shorter step is no better where the velocity jumps, as at contacts of parallel segments: go on.
+            before = control.refused_error[c]
+            jumps = before > wp.float64(0.0) and error > jump * before
+            good = sound and (error < refused * tolerance * dt or jumps or dt <= shortest)
+            if good and not jumps:
                 fade = wp.exp(-dt / memory)
                 level = wp.log(wp.max(error - round_off, tiny * dt) / (dt * dt * dt))
                 control.error_sum[c] = fade * control.error_sum[c] + level * dt
                 control.error_time[c] = fade * control.error_time[c] + dt
                 level = wp.exp(control.error_sum[c] / control.error_time[c])
-                factor = wp.min(growth, wp.sqrt(safety * tolerance / level) / dt)
+                factor = wp.min(growth, wp.max(wp.sqrt(safety * tolerance / level), shortest) / dt)
                 if factor > wp.float64(0.8) and factor < wp.float64(1.25):
                     factor = one
         if good:
-            control.retries[c] = 0
+            control.refused_error[c] = wp.float64(0.0)
             # A step cut short to end on a target says nothing against the longer one wanted before.
             wanted = wp.max(factor * dt, wp.min(factor, one) * control.wanted_step[c])
             control.wanted_step[c] = wp.min(growth * dt, wanted)
@@ -75,7 +79,7 @@ def functions(p: Precision) -> SimpleNamespace:
         control.rejected[c] += 1
         control.wanted_step[c] = wp.float64(0.5) * dt
         if sound:
-            control.retries[c] += 1
+            control.refused_error[c] = error
         else:
             control.wanted_step[c] = wp.float64(0.25) * dt
         return False

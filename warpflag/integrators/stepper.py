@@ -40,8 +40,10 @@ def build_step_control(accuracies: Sequence[float], device: Any) -> Any:
     cells = len(accuracies)
     c = StepControl()
     c.tolerance = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
-    c.wanted_step, c.error_sum, c.error_time = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(3))
-    c.rejected, c.retries = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+    c.wanted_step, c.error_sum, c.error_time, c.refused_error = (
+        wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
+    )
+    c.rejected = wp.zeros(cells, dtype=wp.int32, device=device)
     return c
 
 
@@ -49,7 +51,7 @@ def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
     c.error_sum.zero_()
     c.error_time.zero_()
-    c.retries.zero_()
+    c.refused_error.zero_()
     c.wanted_step.assign(np.where(c.tolerance.numpy() > 0.0, FIRST_STEP, fixed_start))
 
 
