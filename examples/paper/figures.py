@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 PAPER_NAMES = {
     "standard": "(i) standard",
-    "no-hi-between": "(ii) no HI between flagella",
+    "no-hi-between": "(ii) no HI among flagella",
     "no-axial-rotation": "(iii) no axial rotation",
     "no-translation": "(iv) no translation",
     "no-steric": "(v) no steric forces",

@@ -2,7 +2,7 @@
 
 The paper's comes about 10 ms later, in this program it does not. A designed study over what the paper leaves open:
 
-    uv run examples/paper/study.py          about ten minutes on two cores; goes on where it was stopped
+    uv run python examples/paper/study.py     about ten minutes on two cores; goes on where it was stopped
 
 A full factorial design crosses motor torque, length, anchor offset, twist rigidity of the hook, bearing torque and
 starting phase with six readings of the hydrodynamics; a star around the standard run varies one more thing at a time.
