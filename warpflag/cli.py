@@ -148,7 +148,7 @@ def _parser() -> argparse.ArgumentParser:
             "--color", metavar="BY", help="flagellum (default), phase_difference, curvature or steric_force"
         )
         command.add_argument("--follow", action="store_true", help="the camera goes with the cell")
-        command.add_argument("--fps", type=float, help="frames per second of the film (default: 50)")
+        command.add_argument("--fps", type=float, help="pictures per second of the film (default: 50)")
         command.add_argument(
             "--slow-down", type=float, metavar="X", help="times slower than the cell (default: a frame per frame)"
         )
@@ -225,10 +225,12 @@ def _render(options: argparse.Namespace) -> int:
     from warpflag.render import render
 
     filmed_anew = options.color or options.follow or options.slow_down
+    # Its pictures per second say how often the film looks at the movie, not how fast the movie plays.
+    shot = _shot(options) if filmed_anew else None
     render(
         options.source,
         options.output,
-        shot=_shot(options) if filmed_anew else None,
+        shot=shot,
         times=[1e-3 * time for time in options.times],
         snapshots=options.snapshots,
         frames_per_second=options.fps,
@@ -256,24 +258,19 @@ def _export(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":
-            usd.write_movie(records, path, _shot(options))
+            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames)
+            usd.write_movie(records, path, shot)
         else:
             {"vtkhdf": export.write_vtkhdf, "csv": export.write_csv}[options.to](records[0], path)
     print(path)
     return DONE
 
 
-def _shot(options: argparse.Namespace) -> Shot:
+def _shot(options: argparse.Namespace, **more: float | None) -> Shot:
     """How a movie is to be filmed, by what was said of it."""
     from warpflag.usd import Shot
 
-    said = {
-        "color_by": options.color,
-        "follow": options.follow,
-        "frames_per_second": options.fps,
-        "slow_down": options.slow_down,
-        "clip_frames": getattr(options, "clip_frames", None),
-    }
+    said = {"color_by": options.color, "follow": options.follow, "slow_down": options.slow_down, **more}
     return Shot(**{name: value for name, value in said.items() if value is not None})
 
 

@@ -16,10 +16,14 @@ _ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
 def starting_state(scene: Scene) -> InitialState:
     """The shape that a scene asks for, at time 0.
 
-    Raises SceneError where `start.record` can't be read or holds another cell than the scene's.
+    Raises SceneError where `start.record` can't be read or holds another cell than the scene's, and where the scene's
+    own shape begins inside the body.
     """
     if scene.start.record is None:
-        return initial_state(scene)
+        start = initial_state(scene)
+        if scene.body.contact:
+            _check_outside(scene, start)
+        return start
     try:
         with Record(scene.start.record) as record:
             if scene.start.frame >= record.frame_count:
@@ -46,6 +50,21 @@ def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
         body_position=frame.body_position,
         body_orientation=frame.body_orientation,
     )
+
+
+def _check_outside(scene: Scene, start: InitialState) -> None:
+    """Nodes r_1..r_N well below the body's surface would be torn out of it by the contact force in the first step."""
+    half, radius = (scene.body.length - scene.body.width) / 2, scene.body.width / 2
+    for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
+        axis_points = np.zeros_like(nodes)
+        axis_points[:, 2] = np.clip(nodes[:, 2], -half, half)
+        depth = radius - np.linalg.norm(nodes - axis_points, axis=1)[1:]
+        if depth.max() > 0.0:
+            problem = (
+                f"starts flagellum {k} inside the body: node {int(depth.argmax()) + 1} is {depth.max():.3g} um deep"
+            )
+            related = ["flagella.opening_angle", "flagella.phase_difference", f"flagellum.{k}.azimuth"]
+            raise SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
 
 
 def _check_anchors(scene: Scene, start: InitialState) -> None:
