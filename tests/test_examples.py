@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -55,13 +54,3 @@ def test_swim_reads_what_it_recorded(tmp_path):
     with Record(tmp_path / "run.h5") as record:
         assert record.frame_count == 41
         assert f"phase difference {record.observables['phase_difference'][0]:.3f}" in said
-
-
-def test_snapshots_draws_every_flagellum(tmp_path):
-    directory = few_steps(EXAMPLES / "eight_flagella.toml", tmp_path)
-    script("snapshots.py", str(directory), "--times", "0", "0.04", cwd=tmp_path)
-    root = ElementTree.parse(tmp_path / "snapshots.svg").getroot()
-    panels = root.findall("{*}g")
-    assert [panel.findtext("{*}text") for panel in panels] == ["0.0 ms", "0.0 ms"]
-    # 8 flagella of 30 segments and a body in each.
-    assert [len(panel.findall("{*}line")) for panel in panels] == [241, 241]
