@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
 import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
 import pytest
 
 from tests.films import FIRST_NODE, THREE, made_record
+from warpflag import cli
 from warpflag.coloring import Coloring
 from warpflag.export import write_csv, write_vtkhdf
 from warpflag.record import Record, RecordError
@@ -126,3 +128,45 @@ def test_a_record_without_frames_is_no_export(tmp_path, write, name):
     with Record(tmp_path) as record, pytest.raises(RecordError, match="no frames"):
         write(record, tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]
+
+
+def test_the_command_writes_every_format(record, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for to, names in (("usd", ["movie.usdc"]), ("vtkhdf", ["run.vtkhdf"]), ("csv", ["run.csv", "run_nodes.csv"])):
+        assert cli.main(["export", "run", "--to", to]) == 0
+        assert capsys.readouterr().out == f"{Path('run', names[0])}\n"
+        assert all(Path("run", name).stat().st_size > 1000 for name in names)
+    assert (
+        cli.main(["export", "run", "run", "--to", "usd", "-o", "two.usda", "--color", "curvature", "--fps", "24"]) == 0
+    )
+    assert capsys.readouterr().out == "two.usda\n"
+    text = Path("two.usda").read_text()
+    assert "Cell_1" in text and "primvars:curvature" in text and "framesPerSecond = 24" in text
+    assert (
+        cli.main(["export", "run", "--to", "usd", "-o", "clips.usdc", "--clip-frames", "2", "--slow-down", "100"]) == 0
+    )
+    assert len(list(Path("clips.usdc.clips").iterdir())) == 4  # 2 + 2 + 1 frames, manifest
+
+
+def test_the_command_refuses_in_one_line(record, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for arguments, word in (
+        (["run", "run", "--to", "csv", "-o", "two.csv"], "several DIR"),
+        (["run", "run", "--to", "usd"], "-o"),
+        (["run", "--to", "usd", "--color", "mood"], "phase_difference"),
+        (["run", "--to", "usd", "-o", "movie.avi"], ".usdz"),
+    ):
+        assert cli.main(["export", *arguments]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.count("\n") == 1 and word in said.err
+    assert [path.name for path in Path("run").iterdir()] == ["run.h5"]
+
+
+def test_check_tells_what_is_wrong_with_a_movie(record, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["export", "run", "--to", "usd", "-o", "movie.usda"]) == 0
+    assert cli.main(["check", "movie.usda"]) == 0
+    assert capsys.readouterr().out.endswith("movie.usda: plays\n")
+    Path("movie.usda").write_text(Path("movie.usda").read_text().replace("catmullRom", "catmulRom"))
+    assert cli.main(["check", "movie.usda"]) == 2
+    assert "catmulRom" in capsys.readouterr().out

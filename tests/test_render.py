@@ -13,7 +13,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom  # noqa: TID253 (no command line starts here)
 
 from tests.films import FIRST_NODE, made_record
-from warpflag import images
+from warpflag import cli, images
 from warpflag.device import find_device
 from warpflag.images import write_png
 from warpflag.lettering import _GLYPHS, draw_strokes, draw_text, text_width
@@ -373,6 +373,45 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
     with pytest.raises(RecordError, match="no such record"):
         render(tmp_path / "nowhere", tmp_path / "p.png")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bare.usda", "junk.usdc"]
+
+
+def test_the_command_draws(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ["--size", "160x90"]
+    assert cli.main(["render", str(run), "-o", "last.png", *small]) == 0
+    assert capsys.readouterr().out == "last.png\n"
+    render(run, "expected.png", size=(160, 90))
+    assert Path("last.png").read_bytes() == Path("expected.png").read_bytes()
+    options = ["--times", "0.1", "0.4", "--color", "curvature", "--follow", "--radius", "0.08", "--quiet", *small]
+    assert cli.main(["render", str(run), "-o", "two.png", *options]) == 0
+    render(
+        run,
+        "expected.png",
+        size=(160, 90),
+        times=[1e-4, 4e-4],
+        shot=Shot(color_by="curvature", follow=True),
+        radius=0.08,
+    )
+    assert Path("two.png").read_bytes() == Path("expected.png").read_bytes()
+    assert capsys.readouterr() == ("", "")
+    for wrong, word in (
+        (["-o", "p.tiff"], ".png"),
+        (["-o", "p.png", "--device", "tpu"], "tpu"),
+        (["-o", "p.png", "--color", "mood"], "curvature"),
+    ):
+        assert cli.main(["render", str(run), *wrong]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.count("\n") == 1 and word in said.err
+
+
+def test_a_film_s_pace_is_the_movie_s_whatever_its_pictures_per_second(run, tmp_path):
+    image = pytest.importorskip("PIL.Image")
+    for slow_down, seconds in ((None, 0.22), ("800", 0.44)):
+        slower = ["--slow-down", slow_down] if slow_down else ["--follow"]
+        options = ["--size", "64x36", "--fps", "25", "--quiet", *slower]
+        assert cli.main(["render", str(run), "-o", str(tmp_path / "film.gif"), *options]) == 0
+        with image.open(tmp_path / "film.gif") as film:
+            assert 0.04 * film.n_frames == pytest.approx(seconds, abs=0.04)
 
 
 def test_every_letter_is_its_own_and_as_wide_as_it_says():

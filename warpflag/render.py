@@ -35,6 +35,7 @@ _THINNEST = 1.5  # pixels, least radius of a flagellum in a picture
 _INK = (38, 50, 63)
 _FAINT = (112, 124, 138)
 _LENGTHS = [base * 10.0**power for power in range(-3, 4) for base in (1, 2, 5)]  # um, of scale bars
+_LEGEND_ROOM = 30  # heights of a letter: a narrower picture has the scale bar only
 _GUTTER = 3  # pixels between the snapshots of a sheet
 
 
@@ -74,7 +75,8 @@ class Renderer:
             _write_time(picture, self.film.time(code), letter)
         if notes.scale:
             _draw_scale(picture, pixel, letter)
-            _draw_legend(picture, self.film, radius, letter)
+            if size[0] > _LEGEND_ROOM * letter:
+                _draw_legend(picture, self.film, radius, letter)
         return picture
 
     def sheet(self, codes: Sequence[float], progress: Progress) -> NDArray[np.uint8]:

@@ -19,7 +19,7 @@ SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]
 JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
 SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below
-ROUND_OFF = {"float64": 1.0e-14, "float32": 5.0e-6}  # of an error estimate [um]
+ROUND_OFF = {"float64": 1.0e-14, "float32": 1.0e-7}  # of an error estimate [um]
 SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be taken here ends the cell's run
 
 
