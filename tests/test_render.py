@@ -242,6 +242,7 @@ def test_a_legend_says_what_colours_mean(run):
     with made_record(run.parent / "again", 3) as record:
         film = Film(movie_stage(record, Shot(color_by="curvature")))
     plain = Film(run / "movie.usdc")
+    Renderer(film, (640, 360), 3.0).picture(0)  # 300 times as thick can be written, too
     corners = [Renderer(f, (640, 360)).picture(0)[250:330, :200].astype(float) for f in (film, plain)]
     assert (np.ptp(corners[0], axis=2) > 90).sum() > 100 and (np.ptp(corners[1], axis=2) > 90).sum() == 0
 

@@ -207,14 +207,19 @@ def _draw_legend(picture: NDArray[np.uint8], film: Film, radius: float, letter: 
     x, y, small = 1.4 * letter, picture.shape[0] - 1.6 * letter, 0.75 * letter
     factor = radius / film.thinnest()
     if factor > 1.05:
-        draw_text(picture, f"flagella drawn {factor:.2g}x thicker", (x, y), small, _FAINT)
+        draw_text(picture, f"flagella drawn {_short(factor)}x thicker", (x, y), small, _FAINT)
         y -= 2.2 * letter
     label, highest = film.facts.get("colorLabel"), film.facts.get("colorHighest")
     if label and highest:
-        ticks, width, height = ("0", f"{highest:.2g}"), round(9 * letter), round(0.7 * letter)
+        ticks, width, height = ("0", _short(highest)), round(9 * letter), round(0.7 * letter)
         x += text_width(ticks[0], small) + 0.6 * letter
         row, column = round(y - 0.7 * letter), round(x)
         picture[row : row + height, column : column + width] = map_color(np.linspace(0.0, 1.0, width))
         draw_text(picture, ticks[0], (1.4 * letter, y), small, _INK)
         draw_text(picture, ticks[1], (x + width + 0.6 * letter, y), small, _INK)
         draw_text(picture, label, (1.4 * letter, y - 1.5 * letter), small, _INK)
+
+
+def _short(value: float) -> str:
+    """A positive number to two digits, in the letters there are."""
+    return np.format_float_positional(float(f"{value:.2g}"), trim="-")

@@ -19,7 +19,7 @@ SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]
 JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
 SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below
-ROUND_OFF = {"float64": 1.0e-14, "float32": 1.0e-7}  # of an error estimate [um]
+ROUND_OFF = {"float64": 1.0e-14, "float32": 3.0e-7}  # of an error estimate [um]
 SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be taken here ends the cell's run
 
 
@@ -42,7 +42,7 @@ def functions(p: Precision) -> SimpleNamespace:
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
-    tiny, jump, shortest = (wp.constant(wp.float64(x)) for x in (1.0e-12, JUMP, SHORTEST_STEP))
+    jump, shortest = (wp.constant(wp.float64(x)) for x in (JUMP, SHORTEST_STEP))
 
     @wp.func(module=module)
     def accept(control: StepControl, c: wp.int32, dt: wp.float64, error: wp.float64, sound: wp.bool, known: wp.bool):
@@ -62,12 +62,16 @@ def functions(p: Precision) -> SimpleNamespace:
             jumps = before > wp.float64(0.0) and error > jump * before
             good = sound and (error < refused * tolerance * dt or jumps or dt <= shortest)
             if good and not jumps:
-                fade = wp.exp(-dt / memory)
-                level = wp.log(wp.max(error - round_off, tiny * dt) / (dt * dt * dt))
-                control.error_sum[c] = fade * control.error_sum[c] + level * dt
-                control.error_time[c] = fade * control.error_time[c] + dt
-                level = wp.exp(control.error_sum[c] / control.error_time[c])
-                factor = wp.min(growth, wp.max(wp.sqrt(safety * tolerance / level), shortest) / dt)
+                level = wp.log(wp.max(error, round_off) / (dt * dt * dt))
+                # An estimate lost in round-off is a bound from above; longer steps will tell.
+                seen = error > round_off
+                if seen or level * control.error_time[c] < control.error_sum[c]:
+                    fade = wp.exp(-dt / memory)
+                    control.error_sum[c] = fade * control.error_sum[c] + level * dt
+                    control.error_time[c] = fade * control.error_time[c] + dt
+                if seen:
+                    level = wp.exp(control.error_sum[c] / control.error_time[c])
+                    factor = wp.min(growth, wp.max(wp.sqrt(safety * tolerance / level), shortest) / dt)
                 if factor > wp.float64(0.8) and factor < wp.float64(1.25):
                     factor = one
         if good:
