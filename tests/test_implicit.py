@@ -142,10 +142,10 @@ def test_every_scene_follows_rkc(name, device, precision):
 
 
 def hairpin(scene: Scene) -> InitialState:
-    """A flagellum that runs straight off the body, turns round within three joints, and comes back beside itself."""
+    """A flagellum that runs straight off the body, turns round within six joints, and comes back beside itself."""
     anchor, m = attachment(scene, scene.resolved_flagella()[0])
     side = unit(np.cross(m, [0.3, 0.5, 0.1]))
-    angle = np.radians(np.interp(np.arange(10), [4, 7], [0.0, 180.0]))[:, None]
+    angle = np.radians(np.interp(np.arange(10), [2, 8], [0.0, 180.0]))[:, None]
     return placed(scene, [anchor + np.cumsum(0.2 * (np.cos(angle) * m + np.sin(angle) * side), axis=0)])
 
 
@@ -188,7 +188,7 @@ def test_captured_and_eager_contacts_agree_to_the_last_bit(device, precision):
 def test_cells_with_their_own_contacts_equal_their_single_runs(device, precision):
     common = implicit(accuracy=5e-3)
     scenes = [touching_cell(common, precision), cell(common, precision)]
-    scenes += [touching_cell({"flagella.count": 3, **common}, precision, separation=0.05)]
+    scenes += [touching_cell({"flagellum.1.length": 1.2, **common}, precision, separation=0.039)]
     batch = Simulation(scenes, device=device)
     batch.advance(1e-5)
     for c, scene in enumerate(scenes):

@@ -14,7 +14,19 @@ import pytest
 import warp as wp
 from warpflag_kernels import banded, chain, contacts, correction, elastic, hessian, response
 
-from tests.helpers import anchors, carried, cell, matrix, product, quaternion, rotation, shaken, tangents, touching_cell, unit
+from tests.helpers import (
+    anchors,
+    carried,
+    cell,
+    matrix,
+    product,
+    quaternion,
+    rotation,
+    shaken,
+    tangents,
+    touching_cell,
+    unit,
+)
 from tests.oracles import (
     CUTOFF,
     body_gaps,
@@ -64,7 +76,9 @@ class Bench:
         x = chain.types(self.model.precision).Increment()
         node = np.zeros((self.count, 4)) + nodes
         x.node = wp.array(node, dtype=self.model.precision.vec4, device=self.model.device)
-        x.body = wp.array(np.zeros((1, 6)) + body, dtype=chain.types(self.model.precision).vec6, device=self.model.device)
+        x.body = wp.array(
+            np.zeros((1, 6)) + body, dtype=chain.types(self.model.precision).vec6, device=self.model.device
+        )
         return x
 
     def retract(self, x: Any, scale: float = 1.0, carry: Any = None) -> Any:
@@ -372,8 +386,10 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
     y = b.increment(right[:6], right[6:].reshape(-1, 4))
     banded.solve(b.model, b.state, band, y)
     assert band.singular.numpy()[0] == 0
+    # The condition of the matrix grows as h^-4, which leaves float32 two digits on the finest mesh.
+    digits = max(1.0, (0.1 / h) ** 4) if precision == "float32" else 1.0
     for part in (slice(0, 6), displacements(b), spins(b)):
-        assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision)
+        assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision, digits)
 
 
 def displacements(b: Bench) -> np.ndarray:
@@ -533,7 +549,17 @@ def responded(b: Bench, push: float, step: float = 1e-5, gain: float = 2 / 3) ->
     hessian.joint_stiffness(b.model, b.state, s._stiffness)
     response.respond(b.model, b.state, s._contacts, band, s._response, s._groups, free, out)
     assert s._response.failed.numpy()[0] == 0
-    return Responded(b, levers, solver @ (gain * b.mobility() @ levers), free, out)
+    local = b.mobility("none") @ levers
+    flows = near_field(b, levers.shape[1]) * (b.mobility() @ levers - local)
+    return Responded(b, levers, solver @ (gain * (local + flows)), free, out)
+
+
+def near_field(b: Bench, count: int) -> np.ndarray:
+    """1 where the columns take the flow of a contact's pair of forces into account, 0 beyond, by (unknown, contact)."""
+    c, x = b.stepper._contacts, b.state.data.position.numpy().astype(np.float64)
+    away = np.linalg.norm(x[:, None] - x[c.segment.numpy()[:count]], axis=2)
+    near = (away < response.NEAR_FIELD) | (c.other.numpy()[:count] < 0)
+    return np.vstack([np.ones((6, count)), np.repeat(near, 4, axis=0)])
 
 
 RESPONSES = {"all": {}, "none": {"hydrodynamics.mode": "none"}, "within": {"hydrodynamics.mode": "within"}}
@@ -575,7 +601,9 @@ def test_refined_gaps_are_those_of_the_pose_they_lead_to(name, device, precision
     assert s._response.failed.numpy()[0] == 0
     force = r.own("force")
     assert np.abs(rough - caused - r.own("free_gap")).max() < 1e-6
-    assert np.abs(rough - caused + r.levers.T @ r.columns @ force - r.own("solved_gap")).max() < 1.5 * response.FINE * 0.04
+    assert (
+        np.abs(rough - caused + r.levers.T @ r.columns @ force - r.own("solved_gap")).max() < 1.5 * response.FINE * 0.04
+    )
     assert close(flat(r.step), flat(r.free) + r.columns @ force, precision)
     left, before = (np.abs(x - y).max() for x, y in ((measured(r.step), r.own("solved_gap")), (rough, solved)))
     print(name, precision, before, left)

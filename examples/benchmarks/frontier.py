@@ -121,7 +121,11 @@ def plot(tables: dict[str, list[dict[str, Any]]], path: Path) -> None:
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(1, len(tables), figsize=(4.5 * len(tables), 4), sharey=True, squeeze=False)
-    kinds = {"RKC": ("rkc", False), "implicit, fixed step": ("implicit", False), "implicit, controlled": ("implicit", True)}
+    kinds = {
+        "RKC": ("rkc", False),
+        "implicit, fixed step": ("implicit", False),
+        "implicit, controlled": ("implicit", True),
+    }
     for axis, (window, rows) in zip(axes[0], tables.items(), strict=True):
         for label, kind in kinds.items():
             points = [(r["error"], r["cost"]) for r in rows if (r["stepper"], r["controlled"]) == kind]
