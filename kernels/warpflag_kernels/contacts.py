@@ -40,6 +40,60 @@ def struct(p: Precision) -> Any:
 
 
 @functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions of B: what a unit force at a contact acts on, and how an increment changes its gap."""
+    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, chain.types(p).vec6
+    Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
+    Increment = chain.types(p).Increment
+    module = p.module("contacts_functions")
+
+    @wp.func(module=module)
+    def extended(f: vec3):
+        return vec4(f[0], f[1], f[2], real(0.0))
+
+    @wp.func(module=module)
+    def on_body(f: vec3, y: vec3):
+        """Force f at a point y of the body as force and torque."""
+        torque = wp.cross(y, f)
+        return vec6(f[0], f[1], f[2], torque[0], torque[1], torque[2])
+
+    @wp.func(module=module)
+    def body_lever(model: Model, state: State, i: wp.int32, contacts_in: Contacts):
+        """What a unit force at contact i puts on the body: through anchors, or as the body's reaction."""
+        n = contacts_in.normal[i]
+        e = contacts_in.segment[i]
+        j = contacts_in.other[i]
+        if j < 0:
+            return on_body(-n, state.position[e])
+        lever = vec6(real(0.0))
+        if e - 1 == model.first_node[model.flagellum_of[e]]:
+            lever += on_body((real(1.0) - contacts_in.at[i]) * n, state.position[e - 1])
+        if j - 1 == model.first_node[model.flagellum_of[j]]:
+            lever -= on_body((real(1.0) - contacts_in.at_other[i]) * n, state.position[j - 1])
+        return lever
+
+    @wp.func(module=module)
+    def gap_change(model: Model, state: State, contacts_in: Contacts, i: wp.int32, x: Increment):
+        """B^T x of contact i: how an increment changes its gap."""
+        n = extended(contacts_in.normal[i])
+        e = contacts_in.segment[i]
+        j = contacts_in.other[i]
+        s = contacts_in.at[i]
+        change = s * wp.dot(n, x.node[e])
+        change += wp.dot(body_lever(model, state, i, contacts_in), x.body[model.cell_of[e]])
+        if j >= 0:
+            r = contacts_in.at_other[i]
+            change -= r * wp.dot(n, x.node[j])
+            if e - 1 != model.first_node[model.flagellum_of[e]]:
+                change += (real(1.0) - s) * wp.dot(n, x.node[e - 1])
+            if j - 1 != model.first_node[model.flagellum_of[j]]:
+                change -= (real(1.0) - r) * wp.dot(n, x.node[j - 1])
+        return change
+
+    return SimpleNamespace(extended=extended, body_lever=body_lever, gap_change=gap_change)
+
+
+@functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, _vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, hessian, mobility, response
+from warpflag_kernels import banded, chain, contacts, gaps, hessian, mobility, response
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
@@ -24,7 +24,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
-    Contacts, Response = contacts.struct(p), response.types(p).Response
+    Contacts, Response = contacts.struct(p), gaps.types(p).Response
     body_mobility = banded.functions(p).body_mobility
     variant = ("bearing" if bearing_torque else "") + ("touching" if touching else "")
     module = p.module("correction", variant)

@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import banded, chain, chart, contacts, control, correction, guard, hessian, implicit, response
+from warpflag_kernels import (
+    banded,
+    chain,
+    chart,
+    contacts,
+    control,
+    correction,
+    gaps,
+    guard,
+    hessian,
+    implicit,
+    response,
+)
 
 from warpflag.integrators.stepper import (
     DEFAULT_ACCURACY,
@@ -130,7 +142,7 @@ class ImplicitStepper:
             response.respond(model, state, self._contacts, band, self._response, self._groups, self._free_step, x)
             carry = (self._carried, self._carried_before, self._next_last, self._next_before)
             chain.retract(model, state, self._now, i.one, x, self._trial, carry)
-            contacts.measure(model, state, self._trial, self._contacts, self._groups * response.GROUP)
+            contacts.measure(model, state, self._trial, self._contacts, self._groups * gaps.GROUP)
             response.refine(model, state, *touching, self._groups, self._free_step, x)
         for _ in range(self._sweeps):
             correction.correct(
@@ -180,8 +192,8 @@ class ImplicitStepper:
         p, device = model.precision, model.device
         first_node = model.data.first_node.numpy()
         nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
-        groups = np.ceil(3.0 * nodes / response.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
-        capacity = groups * response.GROUP
+        groups = np.ceil(3.0 * nodes / gaps.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
+        capacity = groups * gaps.GROUP
         total = int(capacity.sum())
 
         def zeros(count: int, dtype: Any) -> wp.array:
@@ -198,7 +210,7 @@ class ImplicitStepper:
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
         c.normal = zeros(total, p.vec3)
 
-        t = response.types(p)
+        t = gaps.types(p)
         r = t.Response()
         r.first_column, r.first_entry = offsets(groups * nodes), offsets(capacity**2)
         r.columns, r.body_columns = zeros(int((groups * nodes).sum()), t.mat4g), zeros(int(groups.sum()), t.mat6g)
