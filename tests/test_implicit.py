@@ -157,7 +157,6 @@ def test_a_hairpin_unfolds_as_it_does_with_rkc(device, precision):
         for stepper, p in ((implicit(), precision), (rkc(1e-8), "float64"))
     )
     moved = distance(oracle, Simulation(oracle.scenes[0], device=device, starts=start))
-    print("hairpin", precision, moved, distance(sim, oracle), sim.steps, oracle.steps, sim.stepper.memory()["rejected"])
     assert moved > 0.1
     assert distance(sim, oracle) < 0.01 * moved
 
@@ -235,11 +234,9 @@ def imbalance(numerics: dict[str, Any], frames: int, device: str) -> tuple[float
 
 def test_motor_work_is_dissipation_and_change_of_energy(device):
     left, stored = imbalance(implicit(), 100, device)
-    print(left, stored)
     assert abs(left) < 1e-3 < 0.1 * abs(stored)
 
 
 def test_the_power_balance_is_of_second_order(device):
     coarse, fine = (abs(imbalance(implicit(step), round(2e-4 / step), device)[0]) for step in (1e-5, 5e-6))
-    print(coarse, fine)
     assert coarse < 1e-2 and fine < coarse / 3

@@ -606,7 +606,6 @@ def test_refined_gaps_are_those_of_the_pose_they_lead_to(name, device, precision
     )
     assert close(flat(r.step), flat(r.free) + r.columns @ force, precision)
     left, before = (np.abs(x - y).max() for x, y in ((measured(r.step), r.own("solved_gap")), (rough, solved)))
-    print(name, precision, before, left)
     assert left < 0.2 * before and before > 1e-5
 
 
