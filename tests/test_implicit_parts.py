@@ -54,6 +54,7 @@ ABLATIONS = {
 
 
 def close(found: Any, exact: Any, precision: str, factor: float = 1.0) -> bool:
+    """Within `factor` times the tolerance."""
     found, exact = np.asarray(found, dtype=np.float64), np.asarray(exact, dtype=np.float64)
     return float(np.abs(found - exact).max()) <= factor * TOLERANCE[precision] * float(np.abs(exact).max())
 
@@ -73,12 +74,10 @@ class Bench:
         self.data.active.fill_(1)
 
     def increment(self, body: Any = 0.0, nodes: Any = 0.0) -> Any:
-        x = chain.types(self.model.precision).Increment()
-        node = np.zeros((self.count, 4)) + nodes
-        x.node = wp.array(node, dtype=self.model.precision.vec4, device=self.model.device)
-        x.body = wp.array(
-            np.zeros((1, 6)) + body, dtype=chain.types(self.model.precision).vec6, device=self.model.device
-        )
+        p, device = self.model.precision, self.model.device
+        x = chain.types(p).Increment()
+        x.node = wp.array(np.zeros((self.count, 4)) + nodes, dtype=p.vec4, device=device)
+        x.body = wp.array(np.zeros((1, 6)) + body, dtype=chain.types(p).vec6, device=device)
         return x
 
     def retract(self, x: Any, scale: float = 1.0, carry: Any = None) -> Any:
@@ -146,9 +145,9 @@ class Bench:
                 mobility[i : i + 3, i : i + 3] = across * np.eye(3) + (along - across) * np.outer(axis, axis)
         return mobility
 
-    def local_inverse(self, mode: str = "none") -> np.ndarray:
-        """D^-1 of the nodes, 1 for the body: what `solve` wants the velocities multiplied by. Pseudo-inverse."""
-        d = self.mobility(mode)
+    def local_inverse(self) -> np.ndarray:
+        """D^-1 of the nodes (pseudo-inverse: r_0 has none), 1 for the body: what `solve` wants its velocities times."""
+        d = self.mobility("none")
         d[:6] = d[:, :6] = 0.0
         inverse = np.linalg.pinv(d, hermitian=True)
         inverse[:6, :6] = np.eye(6)
@@ -220,10 +219,10 @@ def test_joint_stiffness_is_the_derivative_of_the_joint_gradients(device, precis
         scale = max(np.abs(ee).max(), np.abs(ff).max())
         for name, exact in (("ee", (ee + ee.T) / 2), ("ff", (ff + ff.T) / 2), ("fe", fe), ("fe", ef.T)):
             assert np.abs(found[name] - exact).max() < TOLERANCE[precision] * scale, (i, name)
-        exact = {"e_first": of_e[3][0], "e_second": of_f[3][0], "f_first": of_e[3][1], "f_second": of_f[3][1]}
-        exact["spins"] = np.array([[of_e[3][2][i], of_f[3][2][i], of_f[3][3][i]]] * (n - 1))
-        for name, values in exact.items():
-            assert np.abs(getattr(k, name).numpy()[i] - values[i]).max() < TOLERANCE[precision] * scale, (i, name)
+        mixed = {"e_first": of_e[3][0], "e_second": of_f[3][0], "f_first": of_e[3][1], "f_second": of_f[3][1]}
+        for name, values in mixed.items():
+            assert close(getattr(k, name).numpy()[i], values[i], precision), (i, name)
+        assert close(k.spins.numpy()[i], [of_e[3][2][i], of_f[3][2][i], of_f[3][3][i]], precision), i
 
 
 def test_stiffness_times_increment_is_the_change_of_the_forces_along_the_chain_chart(device, precision):

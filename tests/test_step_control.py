@@ -14,7 +14,7 @@ from warpflag_kernels import response
 from warpflag_kernels.guard import Fault
 
 from tests.helpers import cell, touching_cell, unit
-from tests.test_implicit import advanced, distance, implicit, reached, same, window, zipping
+from tests.test_implicit import advanced, distance, implicit, reached, window, zipping
 from warpflag.scene import with_values
 from warpflag.simulation import NumericalError, Simulation
 
@@ -77,19 +77,19 @@ def test_every_attempt_is_a_step_or_a_rejected_one(device, precision):
 
 
 def test_a_rejected_step_leaves_no_trace(device):
-    """Steps that fail one after another leave the cell where it was; solvable again, it goes on from there."""
+    """Steps that fail one after another leave the cell where it was."""
     sim = advanced(zipping(implicit(5e-6)), window("contact", device), 2e-5, device)
     first, before, rejected = sim.stepper._contacts.first, sim.cell_state(), counts(sim)[1]
-    memory, room = sim.checkpoint(), first.numpy().copy()
+    memory = sim.checkpoint()
     first.assign(np.array([0, 1]))  # no room for the contacts: nothing can be solved
     with pytest.raises(NumericalError) as caught:
         sim.advance(2.5e-5)
     after, left = sim.cell_state(), sim.checkpoint()
     assert caught.value.kind == Fault.UNSOLVED and counts(sim)[1] > rejected
-    assert same(before, after)
+    for name in ("time", "step", "positions", "directors", "motor_angle", "body_position", "body_orientation"):
+        assert np.array_equal(getattr(before, name), getattr(after, name)), name
     changed = {name for name, values in memory.items() if not np.array_equal(values, left[name])}
     assert changed <= {"stepper.wanted_step", "stepper.rejected", "stepper.evaluations"}
-    assert room[1] > 1
 
 
 def test_after_a_jump_of_the_torque_a_restart_begins_small_and_follows(device):

@@ -2,16 +2,16 @@
 
     uv run examples/benchmarks/frontier.py                        both windows, about half a minute
     uv run examples/benchmarks/frontier.py --precision float32
-    uv run examples/benchmarks/frontier.py --segment-length 0.1 --windows free --accuracies 1e-1 2e-2 --steps 5e-6
+    uv run examples/benchmarks/frontier.py --segment-length 0.1 --windows free --reference-step 2.5e-7 --at 1e-2
 
 Window "free" begins 20 us after the motors start, when the filaments are wound up and nothing touches; "contact"
-begins at 5.5 ms, amid the zipping, with some thirty contacts. Error: largest displacement of a node from the
+begins at 5.5 ms, amid the zipping, with some ten closed contacts. Error: largest displacement of a node from the
 reference at the end [um]. Cost: CPU time of this process per simulated millisecond [ms/ms], the least of several runs,
 without compiling; so it holds on a busy machine, too, if not to the last percent.
 
-The reference is RKC at a fiftieth of its default step (free: a twentieth), in float64, kept in the cache folder. The
-right columns compare at equal error: what RKC would cost at this row's error, by interpolation between its own rows,
-over what this row costs.
+The reference is RKC at steps of 0.5 us (free) and 0.2 us (contact) in float64, kept in the cache folder. The right
+columns compare at equal error: what RKC would cost at this row's error, by interpolation between the logarithms of its
+own rows, over what this row costs. The lines below do so at given errors for both steppers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ DURATION = 1.0e-3
 WINDOWS = {"free": 20e-6, "contact": 5.5e-3}  # where they begin [s]
 REFERENCE_STEP = {"free": 5e-7, "contact": 2e-7}
 RKC_STEPS = [2e-6, 5e-6, 1e-5, 2e-5, 4e-5]
-IMPLICIT_STEPS = [5e-6, 1e-5, 2e-5]
+IMPLICIT_STEPS = [2.5e-6, 5e-6, 1e-5, 2e-5, 3e-5]
 ACCURACIES = [2e-2, 5e-3, 2e-3, 1e-3]
 REPEATS = {"rkc": 1, "implicit": 5}
 
@@ -94,13 +94,17 @@ def measured(args: argparse.Namespace, start: InitialState, exact: np.ndarray, *
     return {**row, "error": float(error), "controlled": "accuracy" in numerics}
 
 
-def rkc_cost(rows: list[dict[str, Any]], error: float) -> float | None:
-    """What RKC costs at an error, by interpolating logarithms; None outside its rows."""
-    points = sorted((np.log(row["error"]), np.log(row["cost"])) for row in rows if row["stepper"] == "rkc")
+def cost_at(rows: list[dict[str, Any]], error: float) -> float | None:
+    """Cost at an error between those of the rows, by interpolating logarithms; None outside."""
+    points = sorted((np.log(row["error"]), np.log(row["cost"])) for row in rows)
     x, y = np.array(points).T if points else (np.empty(0), np.empty(0))
     if not len(x) or not x[0] <= np.log(error) <= x[-1]:
         return None
     return float(np.exp(np.interp(np.log(error), x, y)))
+
+
+def curve(rows: list[dict[str, Any]], stepper: str, controlled: bool) -> list[dict[str, Any]]:
+    return [row for row in rows if (row["stepper"], row["controlled"]) == (stepper, controlled)]
 
 
 def table(rows: list[dict[str, Any]]) -> str:
@@ -108,9 +112,20 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines.append("|---|---|---|---|---|---|---|")
     for row in rows:
         line = f"| {row['stepper']} | {row['setting']} | {row['steps']} | {row['cost']:.1f} | {row['error']:.1e} "
-        equal = rkc_cost(rows, row["error"]) if row["stepper"] != "rkc" else None
+        equal = cost_at(curve(rows, "rkc", False), row["error"]) if row["stepper"] != "rkc" else None
         lines.append(line + ("| | |" if equal is None else f"| {equal:.0f} | {equal / row['cost']:.1f} |"))
     return "\n".join(lines)
+
+
+def comparison(rows: list[dict[str, Any]], error: float) -> str:
+    """Both steppers at one error, in a line; the implicit one with fixed and with controlled steps."""
+    rkc = cost_at(curve(rows, "rkc", False), error)
+    line = f"at {error:g} um: rkc {'?' if rkc is None else f'{rkc:.0f}'}"
+    for controlled, how in ((False, "fixed"), (True, "controlled")):
+        cost = cost_at(curve(rows, "implicit", controlled), error)
+        if cost is not None:
+            line += f"; implicit, {how} {cost:.1f}" + ("" if rkc is None else f", ratio {rkc / cost:.1f}")
+    return line
 
 
 def plot(tables: dict[str, list[dict[str, Any]]], path: Path) -> None:
@@ -128,7 +143,7 @@ def plot(tables: dict[str, list[dict[str, Any]]], path: Path) -> None:
     }
     for axis, (window, rows) in zip(axes[0], tables.items(), strict=True):
         for label, kind in kinds.items():
-            points = [(r["error"], r["cost"]) for r in rows if (r["stepper"], r["controlled"]) == kind]
+            points = [(row["error"], row["cost"]) for row in curve(rows, *kind)]
             if points:
                 axis.loglog(*zip(*sorted(points), strict=True), "o-", label=label)
         axis.set_title(window)
@@ -149,6 +164,7 @@ def main() -> None:
     parser.add_argument("--rkc-steps", nargs="*", type=float, default=RKC_STEPS, help="[s]")
     parser.add_argument("--steps", nargs="*", type=float, default=IMPLICIT_STEPS, help="fixed steps of implicit [s]")
     parser.add_argument("--accuracies", nargs="*", type=float, default=ACCURACIES, help="of implicit [um per ms]")
+    parser.add_argument("--at", nargs="*", type=float, default=[5e-3, 1e-3], help="errors to compare at [um]")
     parser.add_argument("--reference-step", type=float, help="take implicit at this step for the reference [s]")
     parser.add_argument("--cache", type=Path, default=cache, help="folder of the references")
     parser.add_argument("--png", type=Path, help="draw the frontier into this file (needs matplotlib)")
@@ -161,7 +177,8 @@ def main() -> None:
         start = window_start(args, window)
         exact = reference(args, window, start)
         tables[window] = [measured(args, start, exact, **run) for run in runs]
-        print(f"\n{window}, h = {args.segment_length:g} um, {args.precision}\n\n{table(tables[window])}", flush=True)
+        print(f"\n{window}, h = {args.segment_length:g} um, {args.precision}\n\n{table(tables[window])}\n")
+        print("\n".join(comparison(tables[window], error) for error in args.at), flush=True)
     if args.png:
         plot(tables, args.png)
 
