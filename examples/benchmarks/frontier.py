@@ -35,7 +35,7 @@ REFERENCE_STEP = {"free": 5e-7, "contact": 2e-7}
 RKC_STEPS = [2e-6, 5e-6, 1e-5, 2e-5, 4e-5]
 IMPLICIT_STEPS = [2.5e-6, 5e-6, 1e-5, 2e-5, 3e-5]
 ACCURACIES = [2e-2, 5e-3, 2e-3, 1e-3]
-REPEATS = {"rkc": 1, "implicit": 5}
+REPEATS = {"rkc": 3, "implicit": 7}
 
 
 def scene(args: argparse.Namespace, **numerics: Any) -> Scene:
