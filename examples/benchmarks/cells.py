@@ -52,6 +52,20 @@ def shaken(scene: Scene, size: float = 1e-3) -> InitialState:
     return InitialState(tuple(positions), start.directors, start.body_position, start.body_orientation)
 
 
+def shape(sim: Simulation) -> InitialState:
+    """The state that a simulation has reached, as a start at time zero."""
+    state, ends = sim.cell_state(), sim.first_node[1:-1]
+    positions, directors = np.split(state.positions, ends), np.split(state.directors, ends)
+    return InitialState(tuple(positions), tuple(directors), state.body_position, state.body_orientation)
+
+
+def moving_nodes(sim: Simulation) -> np.ndarray:
+    """Which nodes are not anchors, shape [node_count]: those move by the pair sum, the anchors with the body."""
+    moving = np.ones(sim.first_node[-1], dtype=bool)
+    moving[sim.first_node[:-1]] = False
+    return moving
+
+
 def placed(scene: Scene, start: InitialState | None = None) -> Simulation:
     """A simulation whose right-hand side has been evaluated once and can be launched again, stage by stage."""
     sim = Simulation(scene, device="cpu", starts=start)

@@ -59,7 +59,8 @@ def interleaved(contenders: Mapping[str, Contender], rounds: int = 41, turn: flo
     """Median CPU time of one repetition of every contender [s].
 
     Args:
-        contenders: by name; one that has a `granularity` repeats in multiples of it.
+        contenders: by name; one that has a `granularity` repeats in multiples of it, and one that has a method
+            `prepare` is prepared before every turn, which is not timed.
         rounds: turns that each contender gets.
         turn: wanted length of a turn [s].
     """
@@ -73,6 +74,9 @@ def interleaved(contenders: Mapping[str, Contender], rounds: int = 41, turn: flo
 
 
 def _timed(work: Contender, repeats: int) -> float:
+    prepare = getattr(work, "prepare", None)
+    if prepare is not None:
+        prepare()
     begun = time.process_time()
     work(repeats)
     return (time.process_time() - begun) / repeats
@@ -80,9 +84,8 @@ def _timed(work: Contender, repeats: int) -> float:
 
 def _repeats(work: Contender, turn: float) -> int:
     """How often to repeat for a turn of this length."""
-    granularity = getattr(work, "granularity", 1)
-    work(granularity)
-    repeats = granularity
+    repeats = granularity = getattr(work, "granularity", 1)
+    _timed(work, repeats)  # the first time is not like the others
     while (taken := _timed(work, repeats) * repeats) < turn / 4:
         repeats *= 2
     wanted = max(1.0, repeats * turn / taken)

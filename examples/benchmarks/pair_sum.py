@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import placed, shaken, spread
+from cells import moving_nodes, placed, shaken, spread
 from harness import Contender, Repeated, interleaved, save_plot, table
 from native import NativePairSum, compiler
 from warpflag_kernels import mobility
@@ -71,8 +71,7 @@ def case(size: int, precision: str, radius: float | None = None) -> Case:
     positions = sim.cell_state().positions
     model, state = sim.system.model, sim.system.state
     state.data.active.fill_(1)
-    moving = np.ones(len(positions), dtype=bool)
-    moving[sim.first_node[:-1]] = False  # the anchors move with the body
+    moving = moving_nodes(sim)
     drag = local_drag(scene, positions, found.forces, sim.first_node)
     pair = (found.velocities - drag)[moving] * 8 * np.pi * scene.fluid.viscosity
 
