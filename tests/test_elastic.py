@@ -44,7 +44,7 @@ def close(value, expected, precision: str, scale: float | None = None) -> bool:
 def test_forces_and_torques_are_the_energy_gradient(values, precision, device):
     scene = cell(values, precision)
     start = shaken(scene, seed=1)
-    assert steric_energy(scene, start) == 0.0  # nothing but elasticity here
+    assert abs(steric_energy(scene, start)) < 1e-15  # nothing but elasticity here, to round-off
     expected = energy_gradient(scene, start, lambda *at: elastic_energies(*at).sum())
     found = evaluated(scene, start, device)
 
