@@ -117,6 +117,6 @@ def save_plot(path: Path, draw: Callable[[Any], None], size: tuple[float, float]
     figure, axes = pyplot.subplots(figsize=size)
     draw(axes)
     axes.grid(True, which="both", alpha=0.3)
-    axes.legend()
+    axes.legend(fontsize="small")
     figure.tight_layout()
     figure.savefig(path, dpi=150)
