@@ -99,39 +99,47 @@ def local_drag(scene: Scene, positions: np.ndarray, forces: np.ndarray, first_no
 
 
 def numba_sum() -> Callable[..., None] | None:
-    """The loop of pair_sum.cpp in numba."""
+    """The loops of pair_sum.cpp in numba."""
     try:
         import numba
     except ImportError:
         return None
+    compiled = numba.njit(fastmath=True, error_model="numpy")
 
-    @numba.njit(fastmath=True, error_model="numpy")
-    def repeated(repeats, x, y, z, fx, fy, fz, v, a):
-        one, two, third = a.dtype.type(1), a.dtype.type(2), a.dtype.type(1 / 3)
-        radius = a[0]
+    @compiled
+    def part(xi, yi, zi, x, y, z, fx, fy, fz, radius, one, two, third):
+        """Flow of some nodes at a point; constants come in, since a literal would turn float32 into float64."""
         a2 = radius * radius
         near = two * two * a2
         contact = two * two * third / radius
-        slope = a.dtype.type(0.375) / a2
+        slope = (one + one / two) / (two * two) / a2
+        vx = vy = vz = one - one
+        for j in range(len(x)):  # whole arrays: an index that starts anywhere would be checked for its sign
+            dx, dy, dz = xi - x[j], yi - y[j], zi - z[j]
+            r2 = dx * dx + dy * dy + dz * dz
+            inverse = one / np.sqrt(r2)
+            q = a2 * inverse * inverse
+            far_isotropic = inverse * (one + two * third * q)
+            far_along = inverse * inverse * inverse * (one - two * q)
+            isotropic = far_isotropic if r2 > near else contact - slope * r2 * inverse
+            along = far_along if r2 > near else slope * third * inverse
+            along *= dx * fx[j] + dy * fy[j] + dz * fz[j]
+            vx += isotropic * fx[j] + along * dx
+            vy += isotropic * fy[j] + along * dy
+            vz += isotropic * fz[j] + along * dz
+        return vx, vy, vz
+
+    @compiled
+    def repeated(repeats, x, y, z, fx, fy, fz, v, a):
+        one, two, third = a.dtype.type(1), a.dtype.type(2), a.dtype.type(1 / 3)
         for _ in range(repeats):
             for i in range(len(x)):
-                vx = vy = vz = a.dtype.type(0)
-                for part in range(2):
-                    begin, end = (0, i) if part == 0 else (i + 1, len(x))
-                    for j in range(begin, end):
-                        dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
-                        r2 = dx * dx + dy * dy + dz * dz
-                        inverse = one / np.sqrt(r2)
-                        q = a2 * inverse * inverse
-                        far_isotropic = inverse * (one + two * third * q)
-                        far_along = inverse * inverse * inverse * (one - two * q)
-                        isotropic = far_isotropic if r2 > near else contact - slope * r2 * inverse
-                        along = far_along if r2 > near else slope * third * inverse
-                        along *= dx * fx[j] + dy * fy[j] + dz * fz[j]
-                        vx += isotropic * fx[j] + along * dx
-                        vy += isotropic * fy[j] + along * dy
-                        vz += isotropic * fz[j] + along * dz
-                v[0, i], v[1, i], v[2, i] = vx, vy, vz
+                at = (x[i], y[i], z[i])
+                before = part(*at, x[:i], y[:i], z[:i], fx[:i], fy[:i], fz[:i], a[0], one, two, third)
+                k = i + 1
+                after = part(*at, x[k:], y[k:], z[k:], fx[k:], fy[k:], fz[k:], a[0], one, two, third)
+                for axis in range(3):
+                    v[axis, i] = before[axis] + after[axis]
 
     return repeated
 
