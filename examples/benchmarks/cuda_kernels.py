@@ -5,9 +5,11 @@
 
 The kernels are those that a run launches with every term on, under each stepper, and those of the pictures. Warp
 compiles them for the architectures asked for, and the cubins say what they take. Stack: spilled registers and local
-arrays per thread, in bytes; it lies in global memory, behind the caches. Occupancy: the largest share of an SM's
-threads that can be resident with blocks of --block threads, by registers and shared memory; most kernels here are far
-too small to fill a GPU, for them it is the registers that count, since a spill costs at any size.
+arrays per thread, in bytes; it lies in global memory, behind the caches. With 255 registers, the most there are, it is
+spills; with fewer, arrays that are indexed at run time, or the long way through a sine. Shared: per block, 1024 bytes
+of it Warp's own. Occupancy: the largest share of an SM's threads that can be resident with blocks of --block threads,
+by registers and shared memory. A launch here is seldom large enough to fill a GPU: a stack costs at any size, low
+occupancy does not.
 
 With cuobjdump on the PATH the numbers are checked against `cuobjdump -res-usage`.
 """
