@@ -51,9 +51,9 @@ def types(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of the band: the body's mobility."""
-    _real, vec3, vec6 = p.real, p.vec3, types(p).vec6
-    Model, State = structs(p).Model, structs(p).State
+    """Device functions of the band: the body's mobility, and the solution along one flagellum."""
+    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, types(p).vec6
+    Model, State, Band, Increment = structs(p).Model, structs(p).State, types(p).Band, chain.types(p).Increment
 
     @wp.func(module=p.module("banded_functions"))
     def body_mobility(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
@@ -65,17 +65,51 @@ def functions(p: Precision) -> SimpleNamespace:
         w = model.body_spin_mobility[c] * torque_along + model.body_tumble_mobility[c] * (torque - torque_along)
         return vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
-    return SimpleNamespace(body_mobility=body_mobility)
+    @wp.func(module=p.module("banded_functions"))
+    def solve_flagellum(model: Model, band: Band, k: wp.int32, x: Increment):
+        """Solves with the factors of flagellum k, the body at rest; in place."""
+        first = model.first_node[k]
+        end = model.first_node[k + 1]
+        y1 = vec4(real(0.0))
+        y2 = vec4(real(0.0))
+        i = first
+        while i < end:
+            y = x.node[i]
+            if i > first:
+                y -= band.lower1[i] * y1
+            if i > first + 1:
+                y -= band.lower2[i] * y2
+            y = band.diagonal[i] * y
+            x.node[i] = y
+            y2 = y1
+            y1 = y
+            i += 1
+        y1 = vec4(real(0.0))
+        y2 = vec4(real(0.0))
+        i = end - 1
+        while i >= first:
+            y = x.node[i]
+            if i + 1 < end:
+                y -= wp.transpose(band.lower1[i + 1]) * y1
+            if i + 2 < end:
+                y -= wp.transpose(band.lower2[i + 2]) * y2
+            y = wp.transpose(band.diagonal[i]) * y
+            x.node[i] = y
+            y2 = y1
+            y1 = y
+            i -= 1
+
+    return SimpleNamespace(body_mobility=body_mobility, solve_flagellum=solve_flagellum)
 
 
 @functools.cache
 def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    real, vec3 = p.real, p.vec3
     Increment = chain.types(p).Increment
     t = types(p)
     mat44, mat46, mat66, vec6, Band = t.mat44, t.mat46, t.mat66, t.vec6, t.Band
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
-    body_mobility = functions(p).body_mobility
+    body_mobility, solve_flagellum = functions(p).body_mobility, functions(p).solve_flagellum
     module = p.module("banded", "bearing" if bearing_torque else "")
 
     @wp.func(module=module)
@@ -428,38 +462,8 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         x: Increment,
     ):
         k = wp.tid()
-        first = model.first_node[k]
-        end = model.first_node[k + 1]
-        if state.active[model.cell_of[first]] == 0:
-            return
-        y1 = vec4(real(0.0))
-        y2 = vec4(real(0.0))
-        i = first
-        while i < end:
-            y = x.node[i]
-            if i > first:
-                y -= band.lower1[i] * y1
-            if i > first + 1:
-                y -= band.lower2[i] * y2
-            y = band.diagonal[i] * y
-            x.node[i] = y
-            y2 = y1
-            y1 = y
-            i += 1
-        y1 = vec4(real(0.0))
-        y2 = vec4(real(0.0))
-        i = end - 1
-        while i >= first:
-            y = x.node[i]
-            if i + 1 < end:
-                y -= wp.transpose(band.lower1[i + 1]) * y1
-            if i + 2 < end:
-                y -= wp.transpose(band.lower2[i + 2]) * y2
-            y = wp.transpose(band.diagonal[i]) * y
-            x.node[i] = y
-            y2 = y1
-            y1 = y
-            i -= 1
+        if state.active[model.cell_of[model.first_node[k]]] != 0:
+            solve_flagellum(model, band, k, x)
 
     @wp.kernel(module=module)
     def solve_bodies(

@@ -81,4 +81,10 @@ def body_motion(model: DeviceModel, state: DeviceState) -> None:
     kernels = _kernels(model.precision, model.switches.body_contact, model.switches.bearing_torque)
     inputs = [model.data, state.data]
     wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=model.device)
-    wp.launch(kernels.move, model.cell_count, inputs=inputs, device=model.device)
+    move_bodies(model, state)
+
+
+def move_bodies(model: DeviceModel, state: DeviceState) -> None:
+    """The same from the sums of every flagellum, `flagellum_force` and `flagellum_torque`."""
+    kernels = _kernels(model.precision, model.switches.body_contact, model.switches.bearing_torque)
+    wp.launch(kernels.move, model.cell_count, inputs=[model.data, state.data], device=model.device)

@@ -3,7 +3,8 @@
 A contact that closes inside a step has no stiffness before it, so linearising its force across the step would let it
 pass. The step instead treats the gaps of all pairs that may close as unknowns and solves the force law exactly in
 their space. This stage finds the pairs within the cutoff plus a margin, flagellum against flagellum and node against
-body, and keeps them in one list per cell: counted per segment, summed, filled; no atomics, the same order every time.
+body, and keeps them in one list per cell: counted per segment, summed, filled, and chained for the segments of the
+other side; no atomics, the same order every time.
 """
 
 import functools
@@ -28,20 +29,24 @@ def struct(p: Precision) -> Any:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
-        own: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node, then where they start
+        start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
+        stop: wp.array(dtype=wp.int32)  # [E]
+        head: wp.array(dtype=wp.int32)  # [E], first contact whose other side is this segment; -1: none
+        with_body: wp.array(dtype=wp.int32)  # [E], contact of this node with the body; -1: none
         segment: wp.array(dtype=wp.int32)  # [capacity], the segment (or the node, at the body)
         other: wp.array(dtype=wp.int32)  # [capacity], the segment of the other flagellum; -1: the body
         at: wp.array(dtype=real)  # [capacity], parameter on the segment
         at_other: wp.array(dtype=real)  # [capacity]
         normal: wp.array(dtype=vec3)  # [capacity], from the other to this one
         gap: wp.array(dtype=real)  # [capacity], distance of the centre lines, or of the node from the surface [um]
+        next: wp.array(dtype=wp.int32)  # [capacity], next contact with the same other side; -1: none
 
     return Contacts
 
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of B: what a unit force at a contact acts on, and how an increment changes its gap."""
+    """Device functions of B: what forces at the contacts act on, and how an increment changes a gap."""
     real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, chain.types(p).vec6
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
     Increment = chain.types(p).Increment
@@ -90,15 +95,52 @@ def functions(p: Precision) -> SimpleNamespace:
                 change -= (real(1.0) - r) * wp.dot(n, x.node[j - 1])
         return change
 
-    return SimpleNamespace(extended=extended, body_lever=body_lever, gap_change=gap_change)
+    @wp.func(module=module)
+    def segment_loads(contacts_in: Contacts, magnitude: wp.array(dtype=real), e: wp.int32):
+        """Contact forces on the first and second node of segment e >= 1; the second also takes its node's with the
+        body."""
+        on_first = vec3(real(0.0))
+        on_second = vec3(real(0.0))
+        i = contacts_in.start[e]
+        while i < contacts_in.stop[e]:
+            f = magnitude[i] * contacts_in.normal[i]
+            s = contacts_in.at[i]
+            on_first += (real(1.0) - s) * f
+            on_second += s * f
+            i += 1
+        i = contacts_in.head[e]
+        while i >= 0:
+            f = magnitude[i] * contacts_in.normal[i]
+            r = contacts_in.at_other[i]
+            on_first -= (real(1.0) - r) * f
+            on_second -= r * f
+            i = contacts_in.next[i]
+        return on_first, on_second
+
+    @wp.func(module=module)
+    def body_load(
+        model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
+    ):
+        """What the contact forces of a flagellum put on the body: through its anchor, and as reactions."""
+        e = model.first_node[k]
+        load = on_body(on_anchor, state.position[e])
+        end = model.first_node[k + 1]
+        while e < end:
+            i = contacts_in.with_body[e]
+            if i >= 0:
+                load -= on_body(magnitude[i] * contacts_in.normal[i], state.position[e])
+            e += 1
+        return load
+
+    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load)
 
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
-    real, _vec3 = p.real, p.vec3
+    real, vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
     closest_parameters, next_near = steric.functions(p).closest_parameters, steric.functions(p).next_near
-    reach_factor = real(steric.CUTOFF + MARGIN)
+    reach_factor, segment_loads = real(steric.CUTOFF + MARGIN), functions(p).segment_loads
     module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
@@ -155,6 +197,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     contacts.at_other[i] = real(0.0)
                     contacts.gap[i] = distance - model.body_radius[c]
                     contacts.normal[i] = away_from_axis / distance
+                    contacts.with_body[e] = i
                 found += 1
         return found
 
@@ -171,9 +214,10 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         e = wp.tid()
         if state.active[model.cell_of[e]] == 0:
             return
-        contacts.own[e] = 0
+        contacts.stop[e] = 0
+        contacts.with_body[e] = -1
         if e > model.first_node[model.flagellum_of[e]]:
-            contacts.own[e] = visit(model, pose, contacts, e, -1)
+            contacts.stop[e] = visit(model, pose, contacts, e, -1)
 
     @wp.kernel(module=module)
     def sum_up(
@@ -187,19 +231,18 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         c = wp.tid()
         if state.active[c] == 0:
             return
+        begin = contacts.first[c]
         total = int(0)
         e = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
-        capacity = contacts.first[c + 1] - contacts.first[c]
         while e < end:
-            own = contacts.own[e]
-            if own == 0 or total + own > capacity:
-                contacts.own[e] = -1
-                if own > 0:
-                    contacts.overflow[c] = 1
-            else:
-                contacts.own[e] = contacts.first[c] + total
-                total += own
+            own = contacts.stop[e]
+            if begin + total + own > contacts.first[c + 1]:
+                contacts.overflow[c] = 1
+                own = 0
+            contacts.start[e] = begin + total
+            total += own
+            contacts.stop[e] = begin + total
             e += 1
         contacts.count[c] = total
 
@@ -214,8 +257,36 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         contacts: Contacts,
     ):
         e = wp.tid()
-        if state.active[model.cell_of[e]] != 0 and contacts.own[e] >= 0:
-            visit(model, pose, contacts, e, contacts.own[e])
+        if state.active[model.cell_of[e]] != 0 and contacts.stop[e] > contacts.start[e]:
+            visit(model, pose, contacts, e, contacts.start[e])
+
+    @wp.kernel(module=module)
+    def link(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        contacts: Contacts,
+    ):
+        k = wp.tid()
+        begin = model.first_node[k]
+        end = model.first_node[k + 1]
+        c = model.cell_of[begin]
+        if state.active[c] == 0:
+            return
+        e = begin
+        while e < end:
+            contacts.head[e] = -1
+            e += 1
+        if wp.static(segments):
+            i = contacts.first[c] + contacts.count[c] - 1
+            while i >= contacts.first[c]:
+                j = contacts.other[i]
+                if j >= begin and j < end:
+                    contacts.next[i] = contacts.head[j]
+                    contacts.head[j] = i
+                i -= 1
 
     @wp.kernel(module=module)
     def measure(
@@ -247,7 +318,34 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             st = closest_parameters(p1, d1, p2, d2)
             contacts.gap[i] = wp.length(p1 + st[0] * d1 - p2 - st[1] * d2)
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, measure=measure)
+    @wp.kernel(module=module)
+    def act(
+        # Model:
+        model: Model,
+        # State:
+        contacts: Contacts,
+        magnitude: wp.array(dtype=real),
+        # Out:
+        state: State,
+    ):
+        e = wp.tid()
+        if state.active[model.cell_of[e]] == 0:
+            return
+        _before, load = segment_loads(contacts, magnitude, e)
+        if e + 1 < model.first_node[model.flagellum_of[e] + 1]:
+            on_first, _after = segment_loads(contacts, magnitude, e + 1)
+            load += on_first
+        state.force[e] = state.force[e] + load
+        if e > model.first_node[model.flagellum_of[e]]:
+            state.pair_force[e] = state.pair_force[e] + load
+        if wp.static(body):
+            i = contacts.with_body[e]
+            reaction = vec3(real(0.0))
+            if i >= 0:
+                reaction = magnitude[i] * contacts.normal[i]
+            state.body_contact[e] = reaction
+
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, measure=measure, act=act)
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:
@@ -257,6 +355,7 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> No
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts], device=device)
     wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.link, model.flagellum_count, inputs=[model.data, state.data, contacts], device=device)
 
 
 def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, most: int) -> None:
@@ -268,3 +367,10 @@ def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, mo
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
     inputs = [model.data, state.data, pose, contacts]
     wp.launch(kernels.measure, (model.cell_count, most), inputs=inputs, device=model.device)
+
+
+def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
+    """Adds forces of these magnitudes at the listed contacts [pN] to `force` and `pair_force`; `body_contact` too."""
+    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    inputs = [model.data, contacts, magnitude, state.data]
+    wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

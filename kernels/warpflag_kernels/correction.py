@@ -1,12 +1,11 @@
 """Defect correction of an implicit step: the pair sum, which the matrix leaves out, taken into account after all.
 
-With rho the residual of the full equations at e, contact forces F included,
+With rho the residual of the full equations at e, F the contact forces beyond those in V,
 
-    rho = g [V - w delta/dt] + g M (B F - H e) - e/dt,      e <- e + P_c rho
+    rho = g [V - w delta/dt] + g M (B F - H e) - e/dt,      e <- e + z + Y dF,     z = P rho
 
-P_c answers like the factorised system with the closed contacts' stiffness in it: z = P rho changes their gaps, so
-their forces change by dF with (1/k + W) dF = -B^T z, and P_c rho = z + Y dF. One sweep squares the factor by which
-the flows outside the matrix are wrong, and with it the range of flows for which stepping is stable.
+z changes the gaps, and the contact law answers with dF. One sweep squares the factor by which the flows outside the
+matrix are wrong, and with it the range of flows for which stepping is stable.
 """
 
 import functools
@@ -15,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, gaps, hessian, mobility, response
+from warpflag_kernels import banded, body, chain, contact_law, contacts, hessian, mobility
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
@@ -24,8 +23,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
-    Contacts, Response = contacts.struct(p), gaps.types(p).Response
-    body_mobility = banded.functions(p).body_mobility
+    Contacts, Law = contacts.struct(p), contact_law.struct(p)
+    segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
     variant = ("bearing" if bearing_torque else "") + ("touching" if touching else "")
     module = p.module("correction", variant)
 
@@ -82,6 +81,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         model: Model,
         # State:
         stiffness: Stiffness,
+        contacts_in: Contacts,
+        law: Law,
         x: Increment,
         # Out:
         state: State,
@@ -92,8 +93,13 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         k = model.flagellum_of[e]
         force = vec3(real(0.0))
         torque = -state.joint_spin_before[e]
+        if wp.static(touching):
+            _before, force = segment_loads(contacts_in, law.load, e)
+            if e + 1 < model.first_node[k + 1]:
+                on_first, _after = segment_loads(contacts_in, law.load, e + 1)
+                force += on_first
         if e + 1 < model.first_node[k + 1]:
-            force = segment_change(model, state, stiffness, x, e + 1, k)
+            force += segment_change(model, state, stiffness, x, e + 1, k)
         else:
             torque = real(0.0)  # no joint after the last segment
         if e > model.first_node[k]:
@@ -104,56 +110,29 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         state.spin_torque[e] = torque
 
     @wp.kernel(module=module)
-    def add_contacts_and_move_body(
+    def sum_flagellum(
         # Model:
         model: Model,
+        # State:
+        contacts_in: Contacts,
+        law: Law,
         # Out:
         state: State,
-        contacts_in: Contacts,
-        response_in: Response,
     ):
-        c = wp.tid()
-        if state.active[c] == 0:
+        k = wp.tid()
+        first = model.first_node[k]
+        if state.active[model.cell_of[first]] == 0:
             return
-        force = vec3(real(0.0))
-        torque = vec3(real(0.0))
+        force = state.force[first]
+        torque = wp.cross(state.position[first], force)
         if wp.static(touching):
-            i = contacts_in.first[c]
-            end = i + contacts_in.count[c]
-            while i < end:
-                f = response_in.total_force[i] * contacts_in.normal[i]
-                if response_in.total_force[i] != real(0.0):
-                    e = contacts_in.segment[i]
-                    j = contacts_in.other[i]
-                    s = contacts_in.at[i]
-                    r = contacts_in.at_other[i]
-                    state.force[e] = state.force[e] + s * f
-                    state.pair_force[e] = state.pair_force[e] + s * f
-                    if j < 0:
-                        force -= f
-                        torque -= wp.cross(state.position[e], f)
-                    else:
-                        state.force[j] = state.force[j] - r * f
-                        state.pair_force[j] = state.pair_force[j] - r * f
-                        # Shares on r_0 stay out of the pair sum: they are summed for the body below.
-                        state.force[e - 1] = state.force[e - 1] + (real(1.0) - s) * f
-                        if e - 1 > model.first_node[model.flagellum_of[e]]:
-                            state.pair_force[e - 1] = state.pair_force[e - 1] + (real(1.0) - s) * f
-                        state.force[j - 1] = state.force[j - 1] - (real(1.0) - r) * f
-                        if j - 1 > model.first_node[model.flagellum_of[j]]:
-                            state.pair_force[j - 1] = state.pair_force[j - 1] - (real(1.0) - r) * f
-                i += 1
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            first = model.first_node[k]
-            force += state.force[first]
-            torque += wp.cross(state.position[first], state.force[first])
-            if wp.static(bearing_torque):
-                torque -= wp.cross(state.tangent[first], state.joint_before[first])
-            k += 1
-        v = body_mobility(model, state, c, force, torque)
-        state.body_velocity[c] = vec3(v[0], v[1], v[2])
-        state.body_spin[c] = vec3(v[3], v[4], v[5])
+            load = body_load(model, state, contacts_in, law.load, k, force)
+            force = vec3(load[0], load[1], load[2])
+            torque = vec3(load[3], load[4], load[5])
+        if wp.static(bearing_torque):
+            torque -= wp.cross(state.tangent[first], state.joint_before[first])
+        state.flagellum_force[k] = force
+        state.flagellum_torque[k] = torque
 
     @wp.kernel(module=module)
     def residual(
@@ -162,9 +141,10 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         # State:
         state: State,
         band: Band,
-        response_in: Response,
+        law: Law,
         drive: Increment,
         x: Increment,
+        relax: real,
         # Out:
         rho: Increment,
     ):
@@ -173,7 +153,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         if state.active[c] == 0:
             return
         k = model.flagellum_of[e]
-        gain = real(response_in.gain[c])
+        gain = real(law.gain[c])
         inv_dt = real(wp.float64(1.0) / band.step[c])
         d = drive.node[e]
         y = x.node[e]
@@ -190,8 +170,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
             u = state.body_velocity[c]
             w = state.body_spin[c]
             rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
-            rho.body[c] = drive.body[c] + gain * rate - inv_dt * x.body[c]
-        rho.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+            rho.body[c] = relax * (drive.body[c] + gain * rate - inv_dt * x.body[c])
+        rho.node[e] = relax * vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)
     def add(
@@ -214,7 +194,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
     return SimpleNamespace(
         joint_changes=joint_changes,
         gather_changes=gather_changes,
-        add_contacts_and_move_body=add_contacts_and_move_body,
+        sum_flagellum=sum_flagellum,
         residual=residual,
         add=add,
     )
@@ -226,11 +206,13 @@ def correct(
     stiffness: Any,
     band: Any,
     contacts_in: Any,
-    response_in: Any,
+    near: Any,
+    law: Any,
     drive: Any,
     x: Any,
     rho: Any,
     scratch: Any,
+    relax: float = 1.0,
 ) -> None:
     """One sweep of defect correction of the increment x, in place.
 
@@ -241,15 +223,17 @@ def correct(
     touching = model.switches.steric or model.switches.body_contact
     kernels, device = _kernels(model.precision, model.switches.bearing_torque, touching), model.device
     wp.launch(kernels.joint_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
-    wp.launch(kernels.gather_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
-    inputs = [model.data, state.data, contacts_in, response_in]
-    wp.launch(kernels.add_contacts_and_move_body, model.cell_count, inputs=inputs, device=device)
+    inputs = [model.data, stiffness, contacts_in, law, x, state.data]
+    wp.launch(kernels.gather_changes, model.element_count, inputs=inputs, device=device)
+    inputs = [model.data, contacts_in, law, state.data]
+    wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=device)
+    body.move_bodies(model, state)
     mobility.node_velocities(model, state)
-    inputs = [model.data, state.data, band, response_in, drive, x, rho]
+    inputs = [model.data, state.data, band, law, drive, x, relax, rho]
     wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)
     banded.solve(model, state, band, rho)
     change = rho
     if touching:
-        response.yield_contacts(model, state, contacts_in, response_in, rho, scratch)
         change = scratch
+        contact_law.solve(model, state, contacts_in, band, near, rho, law, change)
     wp.launch(kernels.add, model.element_count, inputs=[model.data, state.data, change, x], device=device)

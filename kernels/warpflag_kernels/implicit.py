@@ -16,13 +16,15 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, gaps, step_control
+from warpflag_kernels import banded, chain, contact_law, contacts, step_control
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.chart import vec6d
 from warpflag_kernels.control import NO_FAULT, Control
 from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
+
+GAP_SHARE = 0.1  # of the error that a step may make, for what the contact law leaves over
 
 
 @functools.cache
@@ -51,16 +53,19 @@ def kernels(p: Precision) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
     Chart, Implicit = chart_stage.struct(p), struct(p)
     Band, Contacts = banded.types(p).Band, contacts.struct(p)
-    Response = gaps.types(p).Response
+    Law = contact_law.struct(p)
     _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
     f = step_control.functions(p)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("implicit")
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
+    finest, gap_share = wp.constant(wp.float64(contact_law.FINEST)), wp.constant(wp.float64(GAP_SHARE))
 
     @wp.kernel(module=module)
     def begin(
+        # Model:
+        model: Model,
         # State:
         state: State,
         control: Control,
@@ -69,7 +74,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp: Implicit,
         band: Band,
         contacts_out: Contacts,
-        response_out: Response,
+        law: Law,
     ):
         c = wp.tid()
         if state.active[c] == 0:
@@ -86,8 +91,10 @@ def kernels(p: Precision) -> SimpleNamespace:
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
-        response_out.gain[c] = g
-        response_out.failed[c] = 0
+        law.gain[c] = g
+        law.failed[c] = 0
+        finest_gap = wp.float64(model.steric_diameter[c]) * finest
+        law.tolerance[c] = real(wp.max(finest_gap, gap_share * steps.tolerance[c] * dt))
         contacts_out.overflow[c] = 0
         imp.evaluations[c] += 1
 
@@ -99,7 +106,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         state: State,
         imp: Implicit,
         band: Band,
-        response_in: Response,
+        law: Law,
         last: Increment,
         # Out:
         x: Increment,
@@ -110,7 +117,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         k = model.flagellum_of[e]
-        gain = real(response_in.gain[c])
+        gain = real(law.gain[c])
         slope = real(imp.ratio[c] / band.step[c])
         carried = last.node[e]
         spin = gain * (model.spin_mobility[k] * state.spin_torque[e] - slope * carried[3])
@@ -186,7 +193,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             )
         turn = real(imp.ratio[c]) * last.node[first][3] + x.node[first][3]
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), turn)
-        worst = real(0.0)
+        total = real(0.0)
         if imp.history[c] == 2:
             # Third divided difference of the increments: what a quadratic path leaves over.
             w = imp.ratio[c]
@@ -195,9 +202,9 @@ def kernels(p: Precision) -> SimpleNamespace:
             e = first + 1
             while e < model.first_node[k + 1]:
                 d = x.node[e] - scale * (last.node[e] - real(ratio) * before.node[e])
-                worst = wp.max(worst, wp.length(vec3(d[0], d[1], d[2])))
+                total += d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
                 e += 1
-        imp.error[k] = worst / real(12.0)
+        imp.error[k] = total / real(144.0)
 
     @wp.kernel(module=module)
     def decide(
@@ -207,7 +214,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         state: State,
         band: Band,
         contacts_in: Contacts,
-        response_in: Response,
+        law: Law,
         # Out:
         chart: Chart,
         control: Control,
@@ -218,12 +225,14 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         dt = control.step[c]
-        error = wp.float64(0.0)
+        total = wp.float64(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
-            error = wp.max(error, wp.float64(imp.error[k]))
+            total += wp.float64(imp.error[k])
             k += 1
-        sound = band.singular[c] == 0 and response_in.failed[c] == 0 and contacts_in.overflow[c] == 0
+        nodes = model.first_node[k] - model.first_node[model.first_flagellum[c]]
+        error = wp.float64(3.0) * wp.sqrt(total / wp.float64(nodes))
+        sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, sound, imp.history[c] == 2):
             imp.accepted[c] = 1

@@ -18,22 +18,20 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def pair_flow(p: Precision):
-    """Device function: 8 pi eta times the Rotne-Prager flow at distance vector d from a force, radius a."""
-    real, vec3 = p.real, p.vec3
+def pair_coefficients(p: Precision):
+    """Device function: 8 pi eta times the Rotne-Prager tensor as plain I + along d d, at distance r = |d|, radius a."""
+    real = p.real
 
     @wp.func(module=p.module("mobility_functions"))
-    def rotne_prager(d: vec3, force: vec3, a: real):
-        r2 = wp.dot(d, d)
-        r = wp.sqrt(r2)
-        along = wp.dot(d, force) * d
+    def rotne_prager(r: real, a: real):
         if r > real(2.0) * a:
-            q = a * a / r2
-            return ((real(1.0) + real(2.0) / real(3.0) * q) * force + ((real(1.0) - real(2.0) * q) / r2) * along) / r
-        near = (real(4.0) / real(3.0) - real(0.375) * r / a) / a * force
+            q = a * a / (r * r)
+            plain = (real(1.0) + real(2.0) / real(3.0) * q) / r
+            return plain, (real(1.0) - real(2.0) * q) / (r * r * r)
+        near = (real(4.0) / real(3.0) - real(0.375) * r / a) / a
         if r > real(0.0):
-            near += along / (real(8.0) * a * a * r)
-        return near
+            return near, real(1.0) / (real(8.0) * a * a * r)
+        return near, real(0.0)
 
     return rotne_prager
 

@@ -10,16 +10,20 @@ import numpy as np
 import warp as wp
 from warpflag_kernels import (
     banded,
+    body,
     chain,
     chart,
+    contact_law,
     contacts,
     control,
     correction,
-    gaps,
+    elastic,
+    forces,
     guard,
     hessian,
     implicit,
-    response,
+    mobility,
+    near_field,
 )
 
 from warpflag.integrators.stepper import (
@@ -30,12 +34,13 @@ from warpflag.integrators.stepper import (
     restart_step_control,
 )
 from warpflag.scene import Scene
-from warpflag.stages import launch_right_hand_side
 
 __all__ = ["ImplicitStepper"]
 
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
+ROUGH = 100.0
+"""How many times their tolerance is enough for gaps that only lead to the pose in which they are measured again."""
 SWEEPS = 1
 """Defect corrections per step for the flows that stay outside the matrix."""
 
@@ -84,6 +89,7 @@ class ImplicitStepper:
         self._free_step, self._step = increment(), increment()
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
         self._sweeps = SWEEPS
+        self._relax = [1.0]
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -99,7 +105,12 @@ class ImplicitStepper:
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
         self._band = b
 
-        self._contacts, self._response, self._groups = self._contact_arrays()
+        self._contacts, self._law = self._contact_arrays()
+        n = near_field.struct(p)()
+        n.count = zeros(elements, wp.int32)
+        slots = elements * near_field.SLOTS if self._touches and model.switches.pairs != "none" else 1
+        n.source, n.block = zeros(slots, wp.int32), zeros(slots, t.vec6)
+        self._near = n
 
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
@@ -112,7 +123,7 @@ class ImplicitStepper:
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
         self.steps = build_step_control(accuracies, device)
         # The flows that stay outside the matrix grow with the number of flagella.
-        i.over_implicit.assign([1.3 if len(s.resolved_flagella()) < 3 else 2.0 for s in scenes])
+        i.over_implicit.assign([1.3 if len(s.resolved_flagella()) < 3 else 3.0 for s in scenes])
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -121,33 +132,30 @@ class ImplicitStepper:
         s, i, band = self._system, self.data, self._band
         model, state, device = s.model, s.state, s.model.device
         k = implicit.kernels(model.precision)
-        touching = self._contacts, self._response
-        wp.launch(
-            k.begin, model.cell_count, inputs=[state.data, s.control, self.steps, i, band, *touching], device=device
-        )
+        law = self._contacts, self._law
+        inputs = [model.data, state.data, s.control, self.steps, i, band, *law]
+        wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         carry = (self._last, self._before, self._carried, self._carried_before)
         chain.retract(model, state, self._base, i.ratio, self._last, self._now, carry)
-        launch_right_hand_side(self._free, state)
+        if self._touches:
+            contacts.find(model, state, self._now, self._contacts)
+            contact_law.press(model, state, self._contacts, self._law)
+        self._right_hand_side()
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
-        inputs = [model.data, state.data, i, band, self._response, self._carried]
+        inputs = [model.data, state.data, i, band, self._law, self._carried]
         inputs += [self._free_step, self._drive]
         wp.launch(k.right_hand_side, model.element_count, inputs=inputs, device=device)
         banded.solve(model, state, band, self._free_step)
         x = self._free_step
         if self._touches:
             x = self._step
-            # Contacts of the extrapolated pose, then their gaps in the pose that these lead to.
-            contacts.find(model, state, self._now, self._contacts)
-            response.respond(model, state, self._contacts, band, self._response, self._groups, self._free_step, x)
-            carry = (self._carried, self._carried_before, self._next_last, self._next_before)
-            chain.retract(model, state, self._now, i.one, x, self._trial, carry)
-            contacts.measure(model, state, self._trial, self._contacts, self._groups * gaps.GROUP)
-            response.refine(model, state, *touching, self._groups, self._free_step, x)
-        for _ in range(self._sweeps):
+            self._touch(x)
+        for relax in self._relax:
             correction.correct(
-                model, state, self._stiffness, band, *touching, self._drive, x, self._defect, self._scratch
-            )
+                model, state, self._stiffness, band, self._contacts, self._near, self._law,
+                self._drive, x, self._defect, self._scratch, relax,
+            )  # fmt: skip
         inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
         wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
         inputs = [model.data, state.data, i, self._carried, x, self._total]
@@ -155,7 +163,7 @@ class ImplicitStepper:
         carry = (self._total, self._carried, self._next_last, self._next_before)
         chain.retract(model, state, self._now, i.one, x, self._now, carry)
         guard.check(model, state, s.chart, s.guard, s.control)
-        inputs = [model.data, state.data, band, *touching, s.chart, s.control, self.steps, i]
+        inputs = [model.data, state.data, band, *law, s.chart, s.control, self.steps, i]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
         moved = [self._next_last, self._next_before]
         inputs = [model.data, state.data, i, *moved, self._last, self._before]
@@ -165,6 +173,28 @@ class ImplicitStepper:
         inputs = [state.data, *moved, i, self._last, self._before, s.control]
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         control.count_pass(s.control, device)
+
+    def _right_hand_side(self) -> None:
+        """Velocities at the extrapolated pose, with the contact forces that the list holds."""
+        model, state = self._system.model, self._system.state
+        elastic.joint_gradients(model, state)
+        forces.total_forces(self._free, state)
+        if self._touches:
+            contacts.act(model, state, self._contacts, self._law.force)
+        body.body_motion(model, state)
+        mobility.node_velocities(model, state)
+
+    def _touch(self, x: Any) -> None:
+        """The step with contacts, into x: those of the extrapolated pose, then their gaps in the pose they lead to."""
+        model, state = self._system.model, self._system.state
+        if model.switches.pairs != "none":
+            near_field.build(model, state, self._contacts, self._near)
+        contact_law.solve(
+            model, state, self._contacts, self._band, self._near, self._free_step, self._law, x, coarse=ROUGH
+        )  # fmt: skip
+        carry = (self._carried, self._carried_before, self._next_last, self._next_before)
+        chain.retract(model, state, self._now, self.data.one, x, self._trial, carry)
+        contacts.measure(model, state, self._trial, self._contacts, self._most_contacts)
 
     def restart(self) -> None:
         self.data.history.zero_()
@@ -186,38 +216,36 @@ class ImplicitStepper:
             else:
                 getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
 
-    def _contact_arrays(self) -> tuple[Any, Any, int]:
-        """Lists and matrices of contacts: room for three per node of a cell (eight bundled flagella need two)."""
+    def _contact_arrays(self) -> tuple[Any, Any]:
+        """Contacts and their law: room for three per node of a cell (eight bundled flagella need two)."""
         model = self._system.model
-        p, device = model.precision, model.device
+        p, device, elements = model.precision, model.device, model.element_count
         first_node = model.data.first_node.numpy()
         nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
-        groups = np.ceil(3.0 * nodes / gaps.GROUP).astype(int) if self._touches else np.ones(len(nodes), dtype=int)
-        capacity = groups * gaps.GROUP
-        total = int(capacity.sum())
+        capacity = 3 * nodes if self._touches else np.ones(len(nodes), dtype=int)
+        total, cells = int(capacity.sum()), len(nodes)
+        self._most_contacts = int(capacity.max())
 
         def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
 
-        def offsets(counts: np.ndarray) -> wp.array:
-            return wp.array(np.concatenate([[0], np.cumsum(counts)]), dtype=wp.int32, device=device)
-
         c = contacts.struct(p)()
-        c.first = offsets(capacity)
-        c.count, c.overflow = zeros(len(nodes), wp.int32), zeros(len(nodes), wp.int32)
-        c.own = zeros(model.element_count, wp.int32)
-        c.segment, c.other = zeros(total, wp.int32), zeros(total, wp.int32)
+        c.first = wp.array(np.concatenate([[0], np.cumsum(capacity)]), dtype=wp.int32, device=device)
+        c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
+        c.start, c.stop, c.head, c.with_body = (zeros(elements, wp.int32) for _ in range(4))
+        c.segment, c.other, c.next = (zeros(total, wp.int32) for _ in range(3))
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
         c.normal = zeros(total, p.vec3)
 
-        t = gaps.types(p)
-        r = t.Response()
-        r.first_column, r.first_entry = offsets(groups * nodes), offsets(capacity**2)
-        r.columns, r.body_columns = zeros(int((groups * nodes).sum()), t.mat4g), zeros(int(groups.sum()), t.mat6g)
-        r.compliance, r.factor = (zeros(int((capacity**2).sum()), p.real) for _ in range(2))
-        r.closed = zeros(total, wp.int32)
-        r.free_gap, r.solved_gap, r.residual, r.change = (zeros(total, p.real) for _ in range(4))
-        r.force, r.total_force = zeros(total, p.real), zeros(total, p.real)
-        r.closed_count = zeros(len(nodes), wp.int32)
-        r.gain, r.failed = zeros(len(nodes), wp.float64), zeros(len(nodes), wp.int32)
-        return c, r, int(groups.max())
+        law = contact_law.struct(p)()
+        for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
+            setattr(law, name, zeros(total, p.real))
+        law.basis = zeros((contact_law.DIRECTIONS + 1) * total, p.real)
+        law.moved = zeros(contact_law.DIRECTIONS * total, p.real)
+        law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
+        law.on_body = zeros(model.flagellum_count, chain.types(p).vec6)
+        law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, chain.types(p).vec6)
+        law.partial = zeros(cells * contact_law.LANES, p.real)
+        law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
+        law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
+        return c, law
