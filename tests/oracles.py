@@ -229,7 +229,6 @@ def device_mobility(sim: Simulation) -> np.ndarray:
             force = np.zeros((model.element_count, 3))
             force[node, axis] = 1.0
             state.data.force.assign(force)
-            state.data.pair_force.assign(force)
             mobility.node_velocities(model, state)
             columns.append(state.data.velocity.numpy()[nodes].astype(np.float64).ravel())
     return np.stack(columns, axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels import control as control_stage
-from warpflag_kernels import guard
+from warpflag_kernels import guard, mobility, neighbours
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, Switches, structs
 
 from warpflag.drag import filament_mobility, pair_radius, spheroid_mobility
@@ -117,9 +117,7 @@ def build_state(model: DeviceModel) -> DeviceState:
     def zeros(count: int, dtype: Any) -> wp.array:
         return wp.zeros(count, dtype=dtype, device=device)
 
-    # One block of memory for the positions and one for the pair forces, seen as vectors and as flat numbers.
     s.position, s.force = zeros(elements, p.vec3), zeros(elements, p.vec3)
-    s.pair_force = zeros(elements, p.vec3)
     s.tangent, s.director, s.velocity = (zeros(elements, p.vec3) for _ in range(3))
     s.length = wp.ones(elements, dtype=p.real, device=device)
     s.body_position, s.body_orientation = zeros(cells, wp.vec3d), zeros(cells, wp.quatd)
@@ -134,7 +132,18 @@ def build_state(model: DeviceModel) -> DeviceState:
     s.spin_torque = zeros(elements, p.real)
     s.flagellum_force, s.flagellum_torque = zeros(flagella, p.vec3), zeros(flagella, p.vec3)
     s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
-    return DeviceState(s, s.position.view(p.real).flatten(), s.pair_force.view(p.real).flatten())
+    pairs = structs(p).PairSum()
+    if model.switches.pairs != "none":
+        for name in ("x", "y", "z", "fx", "fy", "fz"):
+            setattr(pairs, name, zeros(elements, p.real))
+        if mobility.sums_by_halves(model):
+            pairs.ux, pairs.uy, pairs.uz = (zeros(elements, p.real) for _ in range(3))
+    near = structs(p).Neighbours()
+    if model.switches.steric:
+        near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
+        near.moved, near.stale = zeros(flagella, p.real), zeros(cells, wp.int32)
+        near.count, near.segment = zeros(elements, wp.int32), zeros(elements * neighbours.SLOTS, wp.int32)
+    return DeviceState(s, pairs, near)
 
 
 def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
@@ -199,6 +208,7 @@ def build_guard(model: DeviceModel, chart: Any) -> Any:
     g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
     if model.switches.steric:
         g.position = wp.clone(chart.base_position)
+        g.moved = wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device)
     return g
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import chain, steric
+from warpflag_kernels import chain, neighbours, steric
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 MARGIN = 0.15  # beyond the cutoff, in units of sigma
@@ -32,14 +32,15 @@ def struct(p: Precision) -> Any:
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
         stop: wp.array(dtype=wp.int32)  # [E]
         head: wp.array(dtype=wp.int32)  # [E], first contact whose other side is this segment; -1: none
-        with_body: wp.array(dtype=wp.int32)  # [E], contact of this node with the body; -1: none
+        body_head: wp.array(dtype=wp.int32)  # [K], first contact of this flagellum with the body; -1: none
         segment: wp.array(dtype=wp.int32)  # [capacity], the segment (or the node, at the body)
         other: wp.array(dtype=wp.int32)  # [capacity], the segment of the other flagellum; -1: the body
         at: wp.array(dtype=real)  # [capacity], parameter on the segment
         at_other: wp.array(dtype=real)  # [capacity]
         normal: wp.array(dtype=vec3)  # [capacity], from the other to this one
         gap: wp.array(dtype=real)  # [capacity], distance of the centre lines, or of the node from the surface [um]
-        next: wp.array(dtype=wp.int32)  # [capacity], next contact with the same other side; -1: none
+        next: wp.array(dtype=wp.int32)  # [capacity], next with that other side, or of that flagellum with the body
+        anchored: wp.array(dtype=wp.int32)  # [capacity], 1: the segment begins at r_0, 2: the other one does, 3: both
 
     return Contacts
 
@@ -47,14 +48,10 @@ def struct(p: Precision) -> Any:
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions of B: what forces at the contacts act on, and how an increment changes a gap."""
-    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, chain.types(p).vec6
+    real, vec3, vec6 = p.real, p.vec3, chain.types(p).vec6
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
     Increment = chain.types(p).Increment
     module = p.module("contacts_functions")
-
-    @wp.func(module=module)
-    def extended(f: vec3):
-        return vec4(f[0], f[1], f[2], real(0.0))
 
     @wp.func(module=module)
     def on_body(f: vec3, y: vec3):
@@ -63,37 +60,41 @@ def functions(p: Precision) -> SimpleNamespace:
         return vec6(f[0], f[1], f[2], torque[0], torque[1], torque[2])
 
     @wp.func(module=module)
-    def body_lever(model: Model, state: State, i: wp.int32, contacts_in: Contacts):
-        """What a unit force at contact i puts on the body: through anchors, or as the body's reaction."""
-        n = contacts_in.normal[i]
-        e = contacts_in.segment[i]
-        j = contacts_in.other[i]
-        if j < 0:
-            return on_body(-n, state.position[e])
-        lever = vec6(real(0.0))
-        if e - 1 == model.first_node[model.flagellum_of[e]]:
-            lever += on_body((real(1.0) - contacts_in.at[i]) * n, state.position[e - 1])
-        if j - 1 == model.first_node[model.flagellum_of[j]]:
-            lever -= on_body((real(1.0) - contacts_in.at_other[i]) * n, state.position[j - 1])
-        return lever
+    def shift(x: Increment, e: wp.int32):
+        d = x.node[e]
+        return vec3(d[0], d[1], d[2])
+
+    @wp.func(module=module)
+    def shift_with_body(x: Increment, c: wp.int32, y: vec3):
+        """How an increment moves a point y of the body."""
+        b = x.body[c]
+        return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), y)
 
     @wp.func(module=module)
     def gap_change(model: Model, state: State, contacts_in: Contacts, i: wp.int32, x: Increment):
         """B^T x of contact i: how an increment changes its gap."""
-        n = extended(contacts_in.normal[i])
         e = contacts_in.segment[i]
         j = contacts_in.other[i]
+        if j < 0:
+            return wp.dot(contacts_in.normal[i], shift(x, e) - shift_with_body(x, model.cell_of[e], state.position[e]))
         s = contacts_in.at[i]
-        change = s * wp.dot(n, x.node[e])
-        change += wp.dot(body_lever(model, state, i, contacts_in), x.body[model.cell_of[e]])
-        if j >= 0:
-            r = contacts_in.at_other[i]
-            change -= r * wp.dot(n, x.node[j])
-            if e - 1 != model.first_node[model.flagellum_of[e]]:
-                change += (real(1.0) - s) * wp.dot(n, x.node[e - 1])
-            if j - 1 != model.first_node[model.flagellum_of[j]]:
-                change -= (real(1.0) - r) * wp.dot(n, x.node[j - 1])
-        return change
+        r = contacts_in.at_other[i]
+        own = s * shift(x, e)
+        other = r * shift(x, j)
+        anchored = contacts_in.anchored[i]
+        if anchored == 0:
+            own += (real(1.0) - s) * shift(x, e - 1)
+            other += (real(1.0) - r) * shift(x, j - 1)
+        else:
+            first = shift_with_body(x, model.cell_of[e], state.position[e - 1])
+            if anchored == 2:
+                first = shift(x, e - 1)
+            own += (real(1.0) - s) * first
+            first = shift_with_body(x, model.cell_of[e], state.position[j - 1])
+            if anchored == 1:
+                first = shift(x, j - 1)
+            other += (real(1.0) - r) * first
+        return wp.dot(contacts_in.normal[i], own - other)
 
     @wp.func(module=module)
     def segment_loads(contacts_in: Contacts, magnitude: wp.array(dtype=real), e: wp.int32):
@@ -122,14 +123,11 @@ def functions(p: Precision) -> SimpleNamespace:
         model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
     ):
         """What the contact forces of a flagellum put on the body: through its anchor, and as reactions."""
-        e = model.first_node[k]
-        load = on_body(on_anchor, state.position[e])
-        end = model.first_node[k + 1]
-        while e < end:
-            i = contacts_in.with_body[e]
-            if i >= 0:
-                load -= on_body(magnitude[i] * contacts_in.normal[i], state.position[e])
-            e += 1
+        load = on_body(on_anchor, state.position[model.first_node[k]])
+        i = contacts_in.body_head[k]
+        while i >= 0:
+            load -= on_body(magnitude[i] * contacts_in.normal[i], state.position[contacts_in.segment[i]])
+            i = contacts_in.next[i]
         return load
 
     return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load)
@@ -139,12 +137,13 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
-    closest_parameters, next_near = steric.functions(p).closest_parameters, steric.functions(p).next_near
+    Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
+    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     reach_factor, segment_loads = real(steric.CUTOFF + MARGIN), functions(p).segment_loads
     module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
-    def visit(model: Model, pose: Pose, contacts: Contacts, e: wp.int32, write: wp.int32):
+    def visit(model: Model, pose: Pose, near: Neighbours, contacts: Contacts, e: wp.int32, write: wp.int32):
         """Contacts that belong to element e: with segments of later flagella, and with the body."""
         k = model.flagellum_of[e]
         c = model.cell_of[e]
@@ -155,16 +154,18 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             p1 = pose.position[e - 1]
             middle = real(0.5) * (p1 + q1)
             own_reach = real(0.5) * pose.length[e] + reach
-            other = k + 1
-            while other < model.first_flagellum[c + 1]:
-                j = model.first_node[other] + 1
-                while j < model.first_node[other + 1]:
+            later = model.first_node[k + 1]
+            n = candidates(model, near, e)
+            entry = int(0)
+            while entry < n:
+                j = candidate(model, near, e, entry)
+                entry += 1
+                if j >= later:
                     p2 = pose.position[j - 1]
                     q2 = pose.position[j]
                     away = middle - real(0.5) * (p2 + q2)
-                    near = own_reach + real(0.5) * pose.length[j]
-                    distance = wp.length(away)
-                    if distance < near:
+                    within = own_reach + real(0.5) * pose.length[j]
+                    if wp.dot(away, away) < within * within:
                         st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
                         apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
                         r = wp.length(apart)
@@ -176,13 +177,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 contacts.at[i] = st[0]
                                 contacts.at_other[i] = st[1]
                                 contacts.gap[i] = r
+                                anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
+                                first = model.first_node[model.flagellum_of[j]]
+                                contacts.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
                                 if r > real(1.0e-3) * model.steric_diameter[c]:
                                     contacts.normal[i] = apart / r
                                 else:
                                     contacts.normal[i] = wp.normalize(wp.cross(q1 - p1, q2 - p2))
                             found += 1
-                    j = next_near(pose.length, j, model.first_node[other + 1], distance, own_reach)
-                other += 1
         if wp.static(body):
             axis = pose.body_axis[c]
             half = model.body_half_length[c]
@@ -197,7 +199,6 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     contacts.at_other[i] = real(0.0)
                     contacts.gap[i] = distance - model.body_radius[c]
                     contacts.normal[i] = away_from_axis / distance
-                    contacts.with_body[e] = i
                 found += 1
         return found
 
@@ -208,6 +209,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         # State:
         state: State,
         pose: Pose,
+        near: Neighbours,
         # Out:
         contacts: Contacts,
     ):
@@ -215,9 +217,8 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         if state.active[model.cell_of[e]] == 0:
             return
         contacts.stop[e] = 0
-        contacts.with_body[e] = -1
         if e > model.first_node[model.flagellum_of[e]]:
-            contacts.stop[e] = visit(model, pose, contacts, e, -1)
+            contacts.stop[e] = visit(model, pose, near, contacts, e, -1)
 
     @wp.kernel(module=module)
     def sum_up(
@@ -253,12 +254,13 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         # State:
         state: State,
         pose: Pose,
+        near: Neighbours,
         # Out:
         contacts: Contacts,
     ):
         e = wp.tid()
         if state.active[model.cell_of[e]] != 0 and contacts.stop[e] > contacts.start[e]:
-            visit(model, pose, contacts, e, contacts.start[e])
+            visit(model, pose, near, contacts, e, contacts.start[e])
 
     @wp.kernel(module=module)
     def link(
@@ -287,6 +289,16 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     contacts.next[i] = contacts.head[j]
                     contacts.head[j] = i
                 i -= 1
+        head = int(-1)
+        if wp.static(body):
+            e = end - 1
+            while e > begin:
+                i = contacts.stop[e] - 1  # a node's contact with the body is the last it lists
+                if i >= contacts.start[e] and contacts.other[i] < 0:
+                    contacts.next[i] = head
+                    head = i
+                e -= 1
+        contacts.body_head[k] = head
 
     @wp.kernel(module=module)
     def measure(
@@ -336,12 +348,10 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             on_first, _after = segment_loads(contacts, magnitude, e + 1)
             load += on_first
         state.force[e] = state.force[e] + load
-        if e > model.first_node[model.flagellum_of[e]]:
-            state.pair_force[e] = state.pair_force[e] + load
         if wp.static(body):
-            i = contacts.with_body[e]
+            i = contacts.stop[e] - 1
             reaction = vec3(real(0.0))
-            if i >= 0:
+            if i >= contacts.start[e] and contacts.other[i] < 0:
                 reaction = magnitude[i] * contacts.normal[i]
             state.body_contact[e] = reaction
 
@@ -349,9 +359,15 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:
-    """Lists every pair of a pose that is in contact or may come into contact within a step."""
+    """Lists every pair of a pose that is in contact or may come into contact within a step.
+
+    Args:
+        pose: the one that `state` holds.
+    """
+    if model.switches.steric:
+        neighbours.refresh(model, state)
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
-    inputs, device = [model.data, state.data, pose, contacts], model.device
+    inputs, device = [model.data, state.data, pose, state.neighbours, contacts], model.device
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts], device=device)
     wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
@@ -370,7 +386,7 @@ def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, mo
 
 
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
-    """Adds forces of these magnitudes at the listed contacts [pN] to `force` and `pair_force`; `body_contact` too."""
+    """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
     inputs = [model.data, contacts, magnitude, state.data]
     wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

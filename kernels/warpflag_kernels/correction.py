@@ -105,7 +105,6 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         if e > model.first_node[k]:
             force -= segment_change(model, state, stiffness, x, e, k)
             torque -= state.joint_spin_after[e - 1]
-            state.pair_force[e] = force
         state.force[e] = force
         state.spin_torque[e] = torque
 

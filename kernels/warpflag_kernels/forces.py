@@ -54,13 +54,12 @@ def _kernel(p: Precision, steric: bool, body_contact: bool):
         if wp.static(body_contact):
             force += state.body_contact[e]
         state.force[e] = force
-        state.pair_force[e] = force
         state.spin_torque[e] = torque
 
     return gather
 
 
 def total_forces(model: DeviceModel, state: DeviceState) -> None:
-    """Force on every node [pN] and torque on every spin [pN um], into `force`, `pair_force` and `spin_torque`."""
+    """Force on every node [pN] and torque on every spin [pN um], into `force` and `spin_torque`."""
     kernel = _kernel(model.precision, model.switches.steric, model.switches.body_contact)
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)

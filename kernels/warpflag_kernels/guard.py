@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels import chart as chart_stage
-from warpflag_kernels import frames, steric
+from warpflag_kernels import frames, neighbours, steric
 from warpflag_kernels.control import STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
@@ -51,12 +51,14 @@ def decode(code: int) -> tuple[Fault, int]:
 @functools.cache
 def struct(p: Precision) -> Any:
     """The struct `Guard`: what the last check saw."""
-    vec3 = p.vec3
+    real, vec3 = p.real, p.vec3
 
     @wp.struct
     class Guard:
         interval: wp.array(dtype=wp.int32)  # [C], steps between two checks
-        position: wp.array(dtype=vec3)  # [E], at the last check [um]; empty where nothing can cross
+        # Empty where nothing can cross.
+        position: wp.array(dtype=vec3)  # [E], at the last check [um]
+        moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
 
     return Guard
 
@@ -67,7 +69,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
     twist_angle = frames.functions(p).twist_angle
-    closest_parameters = steric.functions(p).closest_parameters
+    closest_parameters, next_near = steric.functions(p).closest_parameters, neighbours.functions(p).next_near
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
@@ -196,25 +198,41 @@ def _kernels(p: Precision) -> SimpleNamespace:
         p1n = state.position[e - 1]
         q1n = state.position[e]
         middle = real(0.5) * (p1n + q1n)
-        moved = wp.max(wp.length(p1n - p1), wp.length(q1n - q1))
-        first = model.first_node[k + 1]
-        end = model.first_node[model.first_flagellum[c + 1]]
-        j = first
         other = k + 1
-        while j < end:
-            if j == model.first_node[other + 1]:
-                other += 1
-            if j > model.first_node[other]:
+        while other < model.first_flagellum[c + 1]:
+            reach = real(0.5) * state.length[e] + touch + guard.moved[k] + guard.moved[other]
+            j = model.first_node[other] + 1
+            end = model.first_node[other + 1]
+            while j < end:
                 p2n = state.position[j - 1]
                 q2n = state.position[j]
-                p2 = guard.position[j - 1]
-                q2 = guard.position[j]
-                away = middle - real(0.5) * (p2n + q2n)
-                reach = real(0.5) * (state.length[e] + state.length[j]) + touch
-                reach += moved + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
-                if wp.dot(away, away) < reach * reach and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
-                    wp.atomic_min(control.fault, c, crossing + e)
-            j += 1
+                distance = wp.length(middle - real(0.5) * (p2n + q2n))
+                if distance < reach + real(0.5) * state.length[j]:
+                    p2 = guard.position[j - 1]
+                    q2 = guard.position[j]
+                    if crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
+                        wp.atomic_min(control.fault, c, crossing + e)
+                j = next_near(state.length, j, end, distance, reach)
+            other += 1
+
+    @wp.kernel(module=module)
+    def measure_moves(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        guard: Guard,
+    ):
+        k = wp.tid()
+        e = model.first_node[k]
+        if state.active[model.cell_of[e]] == 0:
+            return
+        moved = real(0.0)
+        while e < model.first_node[k + 1]:
+            moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
+            e += 1
+        guard.moved[k] = moved
 
     @wp.kernel(module=module)
     def remember(
@@ -232,7 +250,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] != 0 and due(control, guard, chart, c):
             guard.position[e] = state.position[e]
 
-    return SimpleNamespace(check_elements=check_elements, check_crossings=check_crossings, remember=remember)
+    return SimpleNamespace(
+        check_elements=check_elements, check_crossings=check_crossings, measure_moves=measure_moves, remember=remember
+    )
 
 
 def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
@@ -242,6 +262,8 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
     if model.switches.steric:
+        moves = [model.data, state.data, guard]
+        wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
         wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
 
 

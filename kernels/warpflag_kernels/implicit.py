@@ -24,7 +24,7 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-GAP_SHARE = 0.1  # of the error that a step may make, for what the contact law leaves over
+GAP_SHARE = 0.2  # of the error that a step may make, for what the contact law leaves over
 
 
 @functools.cache

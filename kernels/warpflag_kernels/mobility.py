@@ -8,9 +8,13 @@ sum of the adjacent tangents, at the last node the last segment's. Pair sum, a t
 
 It runs over the distinct nodes of the same flagellum, of the others, or both, as the scene says. r_0 belongs to the
 body: it moves with the body and its force enters the sum as zero.
+
+Every thread gathers the flows at its own node. A CPU, where one thread does a whole cell, takes every pair once for
+both nodes instead, half the square roots for the same sum.
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -36,59 +40,137 @@ def pair_coefficients(p: Precision):
     return rotne_prager
 
 
+# One row of the sum by halves: pairs (i, j) for j in [begin, end), counted at both nodes. A loop that adds to what it
+# reads is vectorised only if the compiler is told that no two rows overlap, which takes C++; the body is that of
+# `gather_pairs`.
+_ROW = """
+    using R = REAL;
+    const R* __restrict__ X = s.x.data; const R* __restrict__ Y = s.y.data; const R* __restrict__ Z = s.z.data;
+    const R* __restrict__ F = s.fx.data; const R* __restrict__ G = s.fy.data; const R* __restrict__ H = s.fz.data;
+    R* __restrict__ U = s.ux.data; R* __restrict__ V = s.uy.data; R* __restrict__ W = s.uz.data;
+    const R a2 = a * a, near = 4 * a2, contact = R(4) / (R(3) * a), slope = R(0.375) / a2, slope_d = R(0.125) / a2;
+    const R xi = X[i], yi = Y[i], zi = Z[i], fi = F[i], gi = G[i], hi = H[i];
+    R ui = 0, vi = 0, wi = 0;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int j = begin; j < end; ++j) {
+        const R dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
+        const R r2 = dx * dx + dy * dy + dz * dz;
+        const R inv_r = R(1) / wp::sqrt(r2 > R(0) ? r2 : R(1));
+        const R inv_r2 = inv_r * inv_r, q = a2 * inv_r2;
+        const bool far = r2 > near;
+        const R ci = far ? inv_r * (R(1) + R(2) / R(3) * q) : contact - slope * (r2 * inv_r);
+        const R cd = far ? inv_r * inv_r2 * (R(1) - R(2) * q) : slope_d * inv_r;
+        const R dj = cd * (dx * F[j] + dy * G[j] + dz * H[j]), di = cd * (dx * fi + dy * gi + dz * hi);
+        ui += ci * F[j] + dj * dx; vi += ci * G[j] + dj * dy; wi += ci * H[j] + dj * dz;
+        U[j] += ci * fi + di * dx; V[j] += ci * gi + di * dy; W[j] += ci * hi + di * dz;
+    }
+    U[i] += ui; V[i] += vi; W[i] += wi;
+"""
+
+
 @functools.cache
-def _kernel(p: Precision, pairs: str):
+def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
-    Model, State = structs(p).Model, structs(p).State
-    module = p.module("mobility", pairs)
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
+    module = p.module("mobility", pairs + ("_halves" if halves else ""))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
 
-    @wp.func(module=module)
-    def pair_sum(
-        x: wp.array(dtype=real), f: wp.array(dtype=real), i: wp.int32, begin: wp.int32, end: wp.int32, a: real
+    @wp.kernel(module=module)
+    def pack(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
     ):
+        e = wp.tid()
+        x = state.position[e]
+        force = state.force[e]
+        if e == model.first_node[model.flagellum_of[e]]:
+            force = vec3(real(0.0))
+        s.x[e] = x[0]
+        s.y[e] = x[1]
+        s.z[e] = x[2]
+        s.fx[e] = force[0]
+        s.fy[e] = force[1]
+        s.fz[e] = force[2]
+        if wp.static(halves):
+            s.ux[e] = real(0.0)
+            s.uy[e] = real(0.0)
+            s.uz[e] = real(0.0)
+
+    @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
+    def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
+
+    @wp.kernel(module=module)
+    def add_rows(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        i = begin
+        while i < end:
+            own = model.first_node[model.flagellum_of[i]]
+            if i > own:
+                if wp.static(within and between):
+                    add_row(s, i, begin, i, model.pair_radius[c])
+                elif wp.static(within):
+                    add_row(s, i, own, i, model.pair_radius[c])
+                else:
+                    add_row(s, i, begin, own, model.pair_radius[c])
+            i += 1
+
+    @wp.func(module=module)
+    def gather_pairs(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
         """Sum over nodes [begin, end) of 8 pi eta times the Rotne-Prager tensor times the force."""
-        # Flat scalar loads, scalar accumulators and a while loop are what lets the compiler vectorise this.
-        xi = x[3 * i]
-        yi = x[3 * i + 1]
-        zi = x[3 * i + 2]
+        # Scalar loads, scalar accumulators and a while loop are what lets the compiler vectorise this.
+        xi = s.x[i]
+        yi = s.y[i]
+        zi = s.z[i]
         a2 = a * a
         near = real(4.0) * a2
         # The overlapping form in the same units: 8/(6a) = 4/(3a).
-        inv_a = real(1.0) / a
-        contact = real(4.0) / real(3.0) * inv_a
-        slope = real(0.375) * inv_a * inv_a
-        vx = real(0.0)
-        vy = real(0.0)
-        vz = real(0.0)
+        contact = real(4.0) / (real(3.0) * a)
+        slope = real(0.375) / a2
+        slope_d = real(0.125) / a2
+        ux = real(0.0)
+        uy = real(0.0)
+        uz = real(0.0)
         j = begin
         while j < end:
-            dx = xi - x[3 * j]
-            dy = yi - x[3 * j + 1]
-            dz = zi - x[3 * j + 2]
-            fx = f[3 * j]
-            fy = f[3 * j + 1]
-            fz = f[3 * j + 2]
+            dx = xi - s.x[j]
+            dy = yi - s.y[j]
+            dz = zi - s.z[j]
+            fx = s.fx[j]
+            fy = s.fy[j]
+            fz = s.fz[j]
             r2 = dx * dx + dy * dy + dz * dz
-            safe = wp.where(r2 > real(0.0), r2, real(1.0))
-            inv_r2 = real(1.0) / safe
-            inv_r = wp.sqrt(inv_r2)
-            r = r2 * inv_r  # zero, not one, where two nodes coincide
+            inv_r = real(1.0) / wp.sqrt(wp.where(r2 > real(0.0), r2, real(1.0)))
+            inv_r2 = inv_r * inv_r
             q = a2 * inv_r2
             far_i = inv_r * (real(1.0) + real(2.0) / real(3.0) * q)
             far_d = inv_r * inv_r2 * (real(1.0) - real(2.0) * q)
-            near_i = contact - slope * r
-            near_d = slope * inv_r / real(3.0)
-            ci = wp.where(r2 > near, far_i, near_i)
-            cd = wp.where(r2 > near, far_d, near_d)
+            ci = wp.where(r2 > near, far_i, contact - slope * (r2 * inv_r))
+            cd = wp.where(r2 > near, far_d, slope_d * inv_r)
             other = wp.where(j == i, real(0.0), real(1.0))
             df = other * cd * (dx * fx + dy * fy + dz * fz)
             ci = other * ci
-            vx += ci * fx + df * dx
-            vy += ci * fy + df * dy
-            vz += ci * fz + df * dz
+            ux += ci * fx + df * dx
+            uy += ci * fy + df * dy
+            uz += ci * fz + df * dz
             j += 1
-        return vec3(vx, vy, vz)
+        return vec3(ux, uy, uz)
 
     @wp.kernel(module=module)
     def velocities(
@@ -96,8 +178,7 @@ def _kernel(p: Precision, pairs: str):
         model: Model,
         # State:
         state: State,
-        flat_position: wp.array(dtype=real),
-        flat_force: wp.array(dtype=real),
+        s: PairSum,
     ):
         e = wp.tid()
         c = model.cell_of[e]
@@ -115,28 +196,40 @@ def _kernel(p: Precision, pairs: str):
         force = state.force[e]
         along = wp.dot(t, force) * t
         v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
-        if wp.static(pairs != "none"):
+        if wp.static(halves):
+            v += model.pair_mobility[c] * vec3(s.ux[e], s.uy[e], s.uz[e])
+        elif wp.static(pairs != "none"):
             a = model.pair_radius[c]
             pair = vec3(real(0.0))
             if wp.static(within and between):
                 cell_begin = model.first_node[model.first_flagellum[c]]
                 cell_end = model.first_node[model.first_flagellum[c + 1]]
-                pair = pair_sum(flat_position, flat_force, e, cell_begin, cell_end, a)
+                pair = gather_pairs(s, e, cell_begin, cell_end, a)
             elif wp.static(within):
-                pair = pair_sum(flat_position, flat_force, e, begin, end, a)
+                pair = gather_pairs(s, e, begin, end, a)
             else:
                 cell_begin = model.first_node[model.first_flagellum[c]]
                 cell_end = model.first_node[model.first_flagellum[c + 1]]
-                pair = pair_sum(flat_position, flat_force, e, cell_begin, begin, a)
-                pair += pair_sum(flat_position, flat_force, e, end, cell_end, a)
+                pair = gather_pairs(s, e, cell_begin, begin, a)
+                pair += gather_pairs(s, e, end, cell_end, a)
             v += model.pair_mobility[c] * pair
         state.velocity[e] = v
 
-    return velocities
+    return SimpleNamespace(pack=pack, add_rows=add_rows, velocities=velocities)
+
+
+def sums_by_halves(model: DeviceModel) -> bool:
+    """Whether the pair sum visits every pair once for both nodes: where one thread does a whole cell, it pays."""
+    return model.device.is_cpu and model.switches.pairs != "none" and not model.precision.strict
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion."""
-    kernel = _kernel(model.precision, model.switches.pairs)
-    inputs = [model.data, state.data, state.flat_position, state.flat_force]
-    wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
+    halves = sums_by_halves(model)
+    kernels, device = _kernels(model.precision, model.switches.pairs, halves), model.device
+    inputs = [model.data, state.data, state.pairs]
+    if model.switches.pairs != "none":
+        wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
+    if halves:
+        wp.launch(kernels.add_rows, model.cell_count, inputs=inputs, device=device)
+    wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)

@@ -1,11 +1,14 @@
 """Flows between nearby nodes: the part of the pair sum that decides how contacts answer to forces.
 
 Two filaments that push each other apart drag the fluid between them along, which makes the gap several times harder
-to open than local drag alone would. The opposite forces of a contact cancel at a distance, so only neighbours matter:
+to open than local drag alone would. The opposite forces of two segments cancel at a distance, so only neighbours
+matter:
 
-    v_i = sum over loaded nodes j within the reach of  w(r_ij) mu(r_ij) f_j,     w = (1 - r^2/reach^2)^2
+    v_i = sum over loaded nodes j within the reach of  w_ij mu(r_ij) f_j,     w = (1 - d^2/reach^2)^2
 
-The smooth weight keeps the cancellation exact to first order. What it leaves out, the defect correction adds.
+d the distance of the midpoints of the segments that end at the nodes; the smooth weight keeps the cancellation exact
+to first order. A node that is pressed against the body is felt everywhere. What is left out, the defect correction
+adds.
 """
 
 import functools
@@ -14,10 +17,9 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import chain, contacts, mobility
+from warpflag_kernels import chain, contacts, mobility, neighbours
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-REACH = 0.3  # [um]
 SLOTS = 48  # neighbours that a node keeps; more are left to the defect correction
 
 
@@ -63,14 +65,16 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
+def _kernels(p: Precision, pairs: str, steric: bool) -> SimpleNamespace:
     real, vec6 = p.real, chain.types(p).vec6
     Model, State = structs(p).Model, structs(p).State
     Contacts, NearField = contacts.struct(p), struct(p)
     rotne_prager = mobility.pair_coefficients(p)
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
-    slots, reach = wp.constant(SLOTS), wp.constant(real(REACH))
-    module = p.module("near_field", pairs)
+    slots, reach = wp.constant(SLOTS), wp.constant(real(neighbours.REACH))
+    Neighbours, middle = structs(p).Neighbours, neighbours.functions(p).middle
+    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
+    module = p.module("near_field", pairs + ("_steric" if steric else ""))
 
     @wp.func(module=module)
     def loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
@@ -79,6 +83,38 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             return True
         return e + 1 < end and (contacts_in.stop[e + 1] > contacts_in.start[e + 1] or contacts_in.head[e + 1] >= 0)
 
+    @wp.func(module=module)
+    def add(
+        model: Model,
+        state: State,
+        near: NearField,
+        c: wp.int32,
+        e: wp.int32,
+        j: wp.int32,
+        weight: real,
+    ):
+        """The block of source j, times a weight, into the row of node e."""
+        found = near.count[e]
+        if found < slots:
+            d = state.position[e] - state.position[j]
+            plain, along = rotne_prager(wp.length(d), model.pair_radius[c])
+            scale = weight * model.pair_mobility[c]
+            plain = scale * plain
+            s = (scale * along) * d
+            near.source[e * slots + found] = j
+            near.block[e * slots + found] = vec6(
+                plain + s[0] * d[0], s[0] * d[1], s[0] * d[2], plain + s[1] * d[1], s[1] * d[2],
+                plain + s[2] * d[2],
+            )  # fmt: skip
+            near.count[e] = found + 1
+
+    @wp.func(module=module)
+    def taper(state: State, e: wp.int32, j: wp.int32):
+        """Weight of the flow between the nodes at the ends of two segments, by the distance of their midpoints."""
+        d = middle(state, e) - middle(state, j)
+        w = wp.max(real(1.0) - wp.dot(d, d) / (reach * reach), real(0.0))
+        return w * w
+
     @wp.kernel(module=module)
     def build(
         # Model:
@@ -86,6 +122,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         # State:
         state: State,
         contacts_in: Contacts,
+        others: Neighbours,
         # Out:
         near: NearField,
     ):
@@ -93,51 +130,47 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
+        near.count[e] = 0
         own = model.flagellum_of[e]
-        found = int(0)
-        if contacts_in.count[c] > 0 and e > model.first_node[own]:
-            x = state.position[e]
-            k = model.first_flagellum[c]
-            while k < model.first_flagellum[c + 1]:
-                j = model.first_node[k] + 1  # r_0 belongs to the body
-                end = model.first_node[k + 1]
-                if wp.static(not within) and k == own:
-                    j = end
-                if wp.static(not between) and k != own:
-                    j = end
-                while j < end:
-                    d = x - state.position[j]
-                    r = wp.length(d)
-                    pressed = contacts_in.with_body[j] >= 0
-                    near_enough = r < reach and loaded(contacts_in, j, end)
-                    if (pressed or near_enough) and j != e and found < slots:
-                        weight = real(1.0)
-                        if not pressed:
-                            weight = real(1.0) - r * r / (reach * reach)
-                        plain, along = rotne_prager(r, model.pair_radius[c])
-                        scale = weight * weight * model.pair_mobility[c]
-                        plain = scale * plain
-                        s = (scale * along) * d
-                        near.source[e * slots + found] = j
-                        near.block[e * slots + found] = vec6(
-                            plain + s[0] * d[0], s[0] * d[1], s[0] * d[2], plain + s[1] * d[1], s[1] * d[2],
-                            plain + s[2] * d[2],
-                        )  # fmt: skip
-                        found += 1
-                    # Nodes move on along the chain by no more than the lengths of its segments.
-                    bound = r
-                    j += 1
-                    while j < end and bound - state.length[j] > reach and contacts_in.with_body[j] < 0:
-                        bound -= state.length[j]
-                        j += 1
-                k += 1
-        near.count[e] = found
+        first = model.first_node[own]
+        end = model.first_node[own + 1]
+        if e == first or contacts_in.count[c] == 0:
+            return
+        # Pressed against the body: a single force, which nothing cancels at a distance.
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            coupled = wp.where(k == own, wp.static(int(within)), wp.static(int(between)))
+            i = contacts_in.body_head[k]
+            while i >= 0 and coupled > 0:
+                j = contacts_in.segment[i]
+                if j != e:
+                    add(model, state, near, c, e, j, real(1.0) - taper(state, e, j))
+                i = contacts_in.next[i]
+            k += 1
+        if wp.static(within):
+            span = int(reach / model.segment_length[own]) + 1
+            j = wp.max(e - span, first + 1)
+            while j <= e + span and j < end:
+                weight = taper(state, e, j)
+                if j != e and weight > real(0.0) and loaded(contacts_in, j, end):
+                    add(model, state, near, c, e, j, weight)
+                j += 1
+        if wp.static(between and steric):
+            n = candidates(model, others, e)
+            i = int(0)
+            while i < n:
+                j = candidate(model, others, e, i)
+                i += 1
+                if j >= 0:
+                    weight = taper(state, e, j)
+                    if weight > real(0.0) and loaded(contacts_in, j, model.first_node[model.flagellum_of[j] + 1]):
+                        add(model, state, near, c, e, j, weight)
 
     return SimpleNamespace(build=build)
 
 
 def build(model: DeviceModel, state: DeviceState, contacts_in: Any, near: Any) -> None:
     """The near field of the present positions, for loads on nodes that have contacts."""
-    kernel = _kernels(model.precision, model.switches.pairs).build
-    inputs = [model.data, state.data, contacts_in, near]
+    kernel = _kernels(model.precision, model.switches.pairs, model.switches.steric).build
+    inputs = [model.data, state.data, contacts_in, state.neighbours, near]
     wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpflag_kernels import neighbours
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 CUTOFF = 2.0 ** (1.0 / 6.0)  # in units of sigma
@@ -83,23 +84,7 @@ def functions(p: Precision) -> SimpleNamespace:
             s = wp.clamp((b - c) / a, zero, one)
         return vec2(s, t)
 
-    @wp.func(module=p.module("steric_functions"))
-    def next_near(length: wp.array(dtype=real), j: wp.int32, end: wp.int32, distance: real, reach: real):
-        """The next segment of a chain that can be near: along it, midpoints move on by no more than the lengths.
-
-        Args:
-            distance: of the midpoint of segment j [um].
-            reach: how near a segment must come, its own half length not counted [um].
-        """
-        bound = distance - real(0.5) * length[j]
-        i = j + 1
-        while i < end and bound - length[i] > reach:  # false for NaN
-            bound -= length[i]
-            i += 1
-        return i
-
     return SimpleNamespace(
-        next_near=next_near,
         steric_force=steric_force,
         steric_stiffness=steric_stiffness,
         closest_parameters=closest_parameters,
@@ -111,13 +96,16 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    f = functions(p)
-    steric_force, closest_parameters, next_near = f.steric_force, f.closest_parameters, f.next_near
+    Neighbours = structs(p).Neighbours
+    steric_force, closest_parameters = functions(p).steric_force, functions(p).closest_parameters
+    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     cutoff = real(CUTOFF)
 
     @wp.func(module=p.module("steric"))
-    def own_pairs(state: State, e: wp.int32, begin: wp.int32, end: wp.int32, strength: real, diameter: real):
-        """Forces on the first and second node of segment e from segments [begin, end), and the sum of |F|."""
+    def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
+        """Forces on the first and second node of segment e from segments of other flagella, and the sum of |F|."""
+        strength = model.steric_strength[model.cell_of[e]]
+        diameter = model.steric_diameter[model.cell_of[e]]
         first = vec3(real(0.0))
         second = vec3(real(0.0))
         total = real(0.0)
@@ -125,57 +113,37 @@ def _kernels(p: Precision) -> SimpleNamespace:
         q1 = state.position[e]
         middle = real(0.5) * (p1 + q1)
         reach = real(0.5) * state.length[e] + cutoff * diameter
-        j = begin
-        while j < end:
-            p2 = state.position[j - 1]
-            q2 = state.position[j]
-            away = middle - real(0.5) * (p2 + q2)
-            near = reach + real(0.5) * state.length[j]
-            distance = wp.length(away)
-            if distance < near:
-                s = real(0.0)
-                gap = vec3(real(0.0))
-                if e < j:
-                    st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-                    s = st[0]
-                    gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
-                else:
-                    st = closest_parameters(p2, q2 - p2, p1, q1 - p1)
-                    s = st[1]
-                    gap = p1 + st[1] * (q1 - p1) - (p2 + st[0] * (q2 - p2))
-                r = wp.length(gap)
-                magnitude = steric_force(r, strength, diameter)
-                if magnitude > real(0.0):
-                    total += magnitude
-                    # Centre lines that touch exactly have no direction of their own: part them across both.
-                    normal = gap / r
-                    if r <= real(1.0e-3) * diameter:
-                        normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
-                    first += ((real(1.0) - s) * magnitude) * normal
-                    second += (s * magnitude) * normal
-            j = next_near(state.length, j, end, distance, reach)
-        return first, second, total
-
-    @wp.func(module=p.module("steric"))
-    def all_pairs(model: Model, state: State, e: wp.int32):
-        """Forces on segment e from every segment of the other flagella of its cell."""
-        k = model.flagellum_of[e]
-        c = model.cell_of[e]
-        strength = model.steric_strength[c]
-        diameter = model.steric_diameter[c]
-        first = vec3(real(0.0))
-        second = vec3(real(0.0))
-        total = real(0.0)
-        other = model.first_flagellum[c]
-        while other < model.first_flagellum[c + 1]:
-            if other != k:
-                begin = model.first_node[other] + 1
-                end = model.first_node[other + 1]
-                on_first, on_second, sum_of_magnitudes = own_pairs(state, e, begin, end, strength, diameter)
-                first += on_first
-                second += on_second
-                total += sum_of_magnitudes
-            other += 1
+        n = candidates(model, near, e)
+        i = int(0)
+        while i < n:
+            j = candidate(model, near, e, i)
+            i += 1
+            if j >= 0:
+                p2 = state.position[j - 1]
+                q2 = state.position[j]
+                away = middle - real(0.5) * (p2 + q2)
+                within = reach + real(0.5) * state.length[j]
+                if wp.dot(away, away) < within * within:
+                    s = real(0.0)
+                    gap = vec3(real(0.0))
+                    if e < j:
+                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
+                        s = st[0]
+                        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+                    else:
+                        st = closest_parameters(p2, q2 - p2, p1, q1 - p1)
+                        s = st[1]
+                        gap = p1 + st[1] * (q1 - p1) - (p2 + st[0] * (q2 - p2))
+                    r = wp.length(gap)
+                    magnitude = steric_force(r, strength, diameter)
+                    if magnitude > real(0.0):
+                        total += magnitude
+                        # Centre lines that touch exactly have no direction of their own: part them across both.
+                        normal = gap / r
+                        if r <= real(1.0e-3) * diameter:
+                            normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
+                        first += ((real(1.0) - s) * magnitude) * normal
+                        second += (s * magnitude) * normal
         return first, second, total
 
     @wp.kernel(module=p.module("steric"))
@@ -184,11 +152,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
+        near: Neighbours,
     ):
         e = wp.tid()
         if e == model.first_node[model.flagellum_of[e]] or state.active[model.cell_of[e]] == 0:
             return
-        first, second, _total = all_pairs(model, state, e)
+        first, second, _total = pairs_of(model, state, near, e)
         state.steric_first[e] = first
         state.steric_second[e] = second
 
@@ -198,13 +167,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
+        near: Neighbours,
         # Out:
         magnitude_out: wp.array(dtype=real),
     ):
         e = wp.tid()
         total = real(0.0)
         if e > model.first_node[model.flagellum_of[e]]:
-            _first, _second, total = all_pairs(model, state, e)
+            _first, _second, total = pairs_of(model, state, near, e)
         magnitude_out[e] = total
 
     @wp.kernel(module=p.module("steric_body"))
@@ -235,8 +205,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 def segment_contact(model: DeviceModel, state: DeviceState) -> None:
     """Steric forces between flagella, per segment, into `steric_first` and `steric_second` [pN]."""
-    kernel = _kernels(model.precision).segments
-    wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
+    neighbours.refresh(model, state)
+    inputs = [model.data, state.data, state.neighbours]
+    wp.launch(_kernels(model.precision).segments, model.element_count, inputs=inputs, device=model.device)
 
 
 def body_contact(model: DeviceModel, state: DeviceState) -> None:
@@ -247,5 +218,6 @@ def body_contact(model: DeviceModel, state: DeviceState) -> None:
 
 def steric_magnitudes(model: DeviceModel, state: DeviceState, magnitude_out: wp.array) -> None:
     """Sum of |F| over the pairs of each segment [pN], shape [element_count]; every pair counts at both sides."""
-    kernel = _kernels(model.precision).magnitudes
-    wp.launch(kernel, model.element_count, inputs=[model.data, state.data, magnitude_out], device=model.device)
+    neighbours.refresh(model, state)
+    inputs = [model.data, state.data, state.neighbours, magnitude_out]
+    wp.launch(_kernels(model.precision).magnitudes, model.element_count, inputs=inputs, device=model.device)

@@ -70,7 +70,8 @@ class Precision:
 
 @functools.cache
 def structs(p: Precision) -> SimpleNamespace:
-    """The structs `Model` (constant during a run) and `State` (the current evaluation point and its forces).
+    """The structs `Model` (constant during a run), `State` (the current evaluation point and its forces), `PairSum`,
+    `Neighbours`.
 
     C cells, K flagella, E elements. An array that the scene does not need stays empty.
     """
@@ -135,7 +136,6 @@ def structs(p: Precision) -> SimpleNamespace:
         body_contact: wp.array(dtype=vec3)  # [E] [pN]
         # Totals.
         force: wp.array(dtype=vec3)  # [E]; on r_0: what the anchor hands to the body [pN]
-        pair_force: wp.array(dtype=vec3)  # [E]: the same, zero on r_0, which the pair sum leaves to the body [pN]
         spin_torque: wp.array(dtype=real)  # [E], about the tangent [pN um]
         velocity: wp.array(dtype=vec3)  # [E], of the node, lab [um/s]
         flagellum_force: wp.array(dtype=vec3)  # [K], of a flagellum on the body [pN]
@@ -143,7 +143,28 @@ def structs(p: Precision) -> SimpleNamespace:
         body_velocity: wp.array(dtype=vec3)  # [C] [um/s]
         body_spin: wp.array(dtype=vec3)  # [C] [rad/s]
 
-    return SimpleNamespace(Model=Model, State=State)
+    @wp.struct
+    class PairSum:
+        # One array per component: what lets a compiler fill its vector registers. [E] each.
+        x: wp.array(dtype=real)  # position [um]
+        y: wp.array(dtype=real)
+        z: wp.array(dtype=real)
+        fx: wp.array(dtype=real)  # force, zero on r_0, which the sum leaves to the body [pN]
+        fy: wp.array(dtype=real)
+        fz: wp.array(dtype=real)
+        ux: wp.array(dtype=real)  # 8 pi eta times the velocity [pN/um]; only where pairs are summed by halves
+        uy: wp.array(dtype=real)
+        uz: wp.array(dtype=real)
+
+    @wp.struct
+    class Neighbours:
+        position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
+        moved: wp.array(dtype=real)  # [K], largest square of a node's way since [um^2]
+        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
+        count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
+        segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
+
+    return SimpleNamespace(Model=Model, State=State, PairSum=PairSum, Neighbours=Neighbours)
 
 
 @dataclass(frozen=True)
@@ -183,8 +204,8 @@ class DeviceModel:
 
 @dataclass(frozen=True)
 class DeviceState:
-    """State on a device: `data` is the struct `State`; flat views feed the pair sum."""
+    """State on a device: the structs `State`, `PairSum` and `Neighbours` of this precision."""
 
     data: Any
-    flat_position: Any
-    flat_force: Any
+    pairs: Any
+    neighbours: Any

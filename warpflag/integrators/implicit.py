@@ -232,8 +232,9 @@ class ImplicitStepper:
         c = contacts.struct(p)()
         c.first = wp.array(np.concatenate([[0], np.cumsum(capacity)]), dtype=wp.int32, device=device)
         c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
-        c.start, c.stop, c.head, c.with_body = (zeros(elements, wp.int32) for _ in range(4))
-        c.segment, c.other, c.next = (zeros(total, wp.int32) for _ in range(3))
+        c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
+        c.body_head = zeros(model.flagellum_count, wp.int32)
+        c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
         c.normal = zeros(total, p.vec3)
 

@@ -1,0 +1,157 @@
+"""Near segments of other flagella: a list per segment that holds until something has moved by half its skin.
+
+Contact, its search for a step, and the flows between near nodes all ask which segments are close. A list that is a
+skin longer than the reach answers for many passes: it is built anew only when some node of the cell has moved by more
+than half the skin since. A segment in a crowd larger than its list asks all segments instead; either way the answer
+is the same, in the same order.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
+
+REACH = 0.3  # of the flows between near nodes, between the midpoints of their segments [um]
+CONTACT_REACH = 1.35  # of contacts, the cutoff and what a step's search adds [sigma]
+SKIN = 0.1  # [um]
+SLOTS = 64  # segments that a list holds
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions: how many candidates a segment has, which they are, and how to skip along a chain."""
+    real = p.real
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    slots = wp.constant(SLOTS)
+    module = p.module("neighbours_functions")
+
+    @wp.func(module=module)
+    def candidates(model: Model, near: Neighbours, e: wp.int32):
+        """How many segments are to be looked at for segment e."""
+        n = near.count[e]
+        if n < 0:
+            c = model.cell_of[e]
+            n = model.first_node[model.first_flagellum[c + 1]] - model.first_node[model.first_flagellum[c]]
+        return n
+
+    @wp.func(module=module)
+    def candidate(model: Model, near: Neighbours, e: wp.int32, i: wp.int32):
+        """The i-th of them, in ascending order; -1: none."""
+        if near.count[e] >= 0:
+            return near.segment[e * slots + i]
+        j = model.first_node[model.first_flagellum[model.cell_of[e]]] + i
+        k = model.flagellum_of[j]
+        if k == model.flagellum_of[e] or j == model.first_node[k]:
+            return -1
+        return j
+
+    @wp.func(module=module)
+    def middle(state: State, e: wp.int32):
+        return real(0.5) * (state.position[e - 1] + state.position[e])
+
+    @wp.func(module=module)
+    def next_near(length: wp.array(dtype=real), j: wp.int32, end: wp.int32, distance: real, reach: real):
+        """The next segment of a chain that can be near: along it, midpoints move on by no more than the lengths.
+
+        Args:
+            distance: of the midpoint of segment j [um].
+            reach: how near a segment must come, its own half length not counted [um].
+        """
+        bound = distance - real(0.5) * length[j]
+        i = j + 1
+        while i < end and bound - length[i] > reach:  # false for NaN
+            bound -= length[i]
+            i += 1
+        return i
+
+    return SimpleNamespace(candidates=candidates, candidate=candidate, middle=middle, next_near=next_near)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real = p.real
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    middle, next_near = functions(p).middle, functions(p).next_near
+    slots, skin, flow_reach = wp.constant(SLOTS), wp.constant(real(SKIN)), wp.constant(real(REACH))
+    contact_reach = wp.constant(real(CONTACT_REACH))
+    module = p.module("neighbours")
+
+    @wp.kernel(module=module)
+    def measure(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        k = wp.tid()
+        largest = real(0.0)
+        e = model.first_node[k]
+        while e < model.first_node[k + 1]:
+            d = state.position[e] - near.position[e]
+            largest = wp.max(largest, wp.dot(d, d))
+            e += 1
+        near.moved[k] = largest
+
+    @wp.kernel(module=module)
+    def judge(
+        # Model:
+        model: Model,
+        # Out:
+        near: Neighbours,
+    ):
+        c = wp.tid()
+        largest = real(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            largest = wp.max(largest, near.moved[k])
+            k += 1
+        near.stale[c] = wp.where(real(4.0) * largest < skin * skin, 0, 1)  # 1 for NaN
+
+    @wp.kernel(module=module)
+    def build(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if near.stale[c] == 0:
+            return
+        own = model.flagellum_of[e]
+        near.position[e] = state.position[e]
+        found = int(0)
+        if e > model.first_node[own]:
+            x = middle(state, e)
+            beyond = wp.max(flow_reach, contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e])
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                j = model.first_node[k] + 1
+                end = model.first_node[k + 1]
+                while j < end and k != own:
+                    distance = wp.length(x - middle(state, j))
+                    # Lengths hardly change; what they do is in the skin, like what the nodes move.
+                    if distance < beyond + skin + real(0.55) * state.length[j]:
+                        if found < slots:
+                            near.segment[e * slots + found] = j
+                        found += 1
+                    j = next_near(state.length, j, end, distance, beyond + skin + real(0.1) * state.length[j])
+                k += 1
+        near.count[e] = wp.where(found <= slots, found, -1)
+
+    return SimpleNamespace(measure=measure, judge=judge, build=build)
+
+
+def refresh(model: DeviceModel, state: DeviceState) -> None:
+    """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
+    kernels, near, device = _kernels(model.precision), state.neighbours, model.device
+    inputs = [model.data, state.data, near]
+    wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
+    wp.launch(kernels.judge, model.cell_count, inputs=[model.data, near], device=device)
+    wp.launch(kernels.build, model.element_count, inputs=inputs, device=device)
