@@ -211,7 +211,6 @@ def correct(
     x: Any,
     rho: Any,
     scratch: Any,
-    relax: float = 1.0,
 ) -> None:
     """One sweep of defect correction of the increment x, in place.
 
@@ -220,19 +219,42 @@ def correct(
         rho, scratch: increments to work in; the forces of `state` are overwritten.
     """
     touching = model.switches.steric or model.switches.body_contact
-    kernels, device = _kernels(model.precision, model.switches.bearing_torque, touching), model.device
-    wp.launch(kernels.joint_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
-    inputs = [model.data, stiffness, contacts_in, law, x, state.data]
-    wp.launch(kernels.gather_changes, model.element_count, inputs=inputs, device=device)
-    inputs = [model.data, contacts_in, law, state.data]
-    wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=device)
-    body.move_bodies(model, state)
-    mobility.node_velocities(model, state)
-    inputs = [model.data, state.data, band, law, drive, x, relax, rho]
-    wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)
+    defect(model, state, stiffness, band, law, drive, x, rho, contacts_in if touching else None)
     banded.solve(model, state, band, rho)
     change = rho
     if touching:
         change = scratch
         contact_law.solve(model, state, contacts_in, band, near, rho, law, change)
-    wp.launch(kernels.add, model.element_count, inputs=[model.data, state.data, change, x], device=device)
+    kernels = _kernels(model.precision, model.switches.bearing_torque, touching)
+    wp.launch(kernels.add, model.element_count, inputs=[model.data, state.data, change, x], device=model.device)
+
+
+def defect(
+    model: DeviceModel,
+    state: DeviceState,
+    stiffness: Any,
+    band: Any,
+    law: Any,
+    drive: Any,
+    x: Any,
+    rho: Any,
+    contacts_in: Any = None,
+    relax: float = 1.0,
+) -> None:
+    """D^-1 times the residual of the full equations at x, into rho; without contact forces where there is no list.
+
+    Args:
+        relax: a factor of the residual.
+    """
+    touching = contacts_in is not None
+    kernels, device = _kernels(model.precision, model.switches.bearing_torque, touching), model.device
+    listed = contacts_in if touching else contacts.struct(model.precision)()
+    wp.launch(kernels.joint_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
+    inputs = [model.data, stiffness, listed, law, x, state.data]
+    wp.launch(kernels.gather_changes, model.element_count, inputs=inputs, device=device)
+    inputs = [model.data, listed, law, state.data]
+    wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=device)
+    body.move_bodies(model, state)
+    mobility.node_velocities(model, state)
+    inputs = [model.data, state.data, band, law, drive, x, relax, rho]
+    wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)

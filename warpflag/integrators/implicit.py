@@ -24,6 +24,7 @@ from warpflag_kernels import (
     implicit,
     mobility,
     near_field,
+    stability,
 )
 
 from warpflag.integrators.stepper import (
@@ -41,6 +42,8 @@ LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
 ROUGH = 100.0
 """How many times their tolerance is enough for gaps that only lead to the pose in which they are measured again."""
+OVER_IMPLICIT_CROWD = 3.0
+"""Over-implicitness with which three flagella or more begin, until it has been measured."""
 SWEEPS = 1
 """Defect corrections per step for the flows that stay outside the matrix."""
 
@@ -87,9 +90,9 @@ class ImplicitStepper:
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
         self._free_step, self._step = increment(), increment()
+        self._nothing, self._probe = increment(), increment()
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
         self._sweeps = SWEEPS
-        self._relax = [1.0]
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -122,8 +125,7 @@ class ImplicitStepper:
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
         self.steps = build_step_control(accuracies, device)
-        # The flows that stay outside the matrix grow with the number of flagella.
-        i.over_implicit.assign([1.3 if len(s.resolved_flagella()) < 3 else 3.0 for s in scenes])
+        self.stability = self._stability_arrays()
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -151,10 +153,10 @@ class ImplicitStepper:
         if self._touches:
             x = self._step
             self._touch(x)
-        for relax in self._relax:
+        for _ in range(self._sweeps):
             correction.correct(
                 model, state, self._stiffness, band, self._contacts, self._near, self._law,
-                self._drive, x, self._defect, self._scratch, relax,
+                self._drive, x, self._defect, self._scratch,
             )  # fmt: skip
         inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
         wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
@@ -171,6 +173,9 @@ class ImplicitStepper:
         chart.commit(model, state, s.chart)
         guard.remember(model, state, s.chart, s.guard, s.control)
         inputs = [state.data, *moved, i, self._last, self._before, s.control]
+        if self._crowded:
+            stability.schedule(model, state, i.evaluations, self.stability)
+            wp.capture_if(self.stability.due, self._measure_stability)
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         control.count_pass(s.control, device)
 
@@ -196,25 +201,57 @@ class ImplicitStepper:
         chain.retract(model, state, self._now, self.data.one, x, self._trial, carry)
         contacts.measure(model, state, self._trial, self._contacts, self._most_contacts)
 
+    def _measure_stability(self) -> None:
+        model, state = self._system.model, self._system.state
+        stability.measure(
+            model, state, self._stiffness, self._band, self._law, self._nothing, self._defect, self.stability,
+            self.data.over_implicit,
+        )  # fmt: skip
+
     def restart(self) -> None:
+        self.data.over_implicit.fill_(OVER_IMPLICIT_CROWD if self._crowded else stability.LEAST)
         self.data.history.zero_()
         restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("last_step", "step_before", "history", "evaluations")
+        names = ("last_step", "step_before", "history", "evaluations", "over_implicit")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
-        for name, x in (("last", self._last), ("before", self._before)):
+        for name, x in (("last", self._last), ("before", self._before), ("probe", self._probe)):
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
+        carried = {"last": self._last, "before": self._before, "probe": self._probe}
         for name, values in memory.items():
             whose, _, part = name.partition("_")
             if part in ("node", "body"):
-                getattr(self._last if whose == "last" else self._before, part).assign(values)
+                getattr(carried[whose], part).assign(values)
             else:
                 getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
+
+    def _stability_arrays(self) -> Any:
+        """Of cells with three flagella or more; fewer need no measurement."""
+        model = self._system.model
+        first_flagellum, first_node = model.data.first_flagellum.numpy(), model.data.first_node.numpy()
+        self._crowded = model.switches.pairs != "none" and int(np.diff(first_flagellum).max()) > 2
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(count if self._crowded else 1, dtype=dtype, device=model.device)
+
+        s = stability.struct(model.precision)()
+        s.kappa, s.size = zeros(model.cell_count, wp.float64), zeros(model.flagellum_count, wp.float64)
+        s.look, s.active, s.due = (
+            zeros(model.cell_count, wp.int32),
+            zeros(model.cell_count, wp.int32),
+            zeros(1, wp.int32),
+        )
+        s.probe = self._probe
+        # A direction with a share of every mode: random, but the same in every run and every cell.
+        cell_first = first_node[first_flagellum]
+        probe = [np.random.default_rng(0).standard_normal((n, 4)) for n in np.diff(cell_first)]
+        s.probe.node.assign(np.concatenate(probe) / np.sqrt(model.element_count))
+        return s
 
     def _contact_arrays(self) -> tuple[Any, Any]:
         """Contacts and their law: room for three per node of a cell (eight bundled flagella need two)."""
