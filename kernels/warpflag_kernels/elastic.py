@@ -35,16 +35,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
         k = model.flagellum_of[e]
         if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
             return  # the last segment has no joint after it: its entries stay zero
-        h = model.segment_length[k]
+        per_length = real(1.0) / model.segment_length[k]
         t = state.tangent[e]
         u = state.tangent[e + 1]
         a1 = state.director[e]
         b1 = state.director[e + 1]
-        chi = real(1.0) + wp.dot(t, u)
-        kb = wp.cross(t, u) * (real(2.0) / chi)
+        per_chi = real(1.0) / (real(1.0) + wp.dot(t, u))
+        kb = wp.cross(t, u) * (real(2.0) * per_chi)
         twist = twist_angle(t, u, a1, b1)
         if e == model.first_node[k]:
-            moment = model.hook_rigidity[k] / h * twist
+            moment = model.hook_rigidity[k] * per_length * twist
             gradient = (real(0.5) * moment) * kb
             state.joint_before[e] = gradient
             state.joint_after[e] = gradient / state.length[e + 1]
@@ -56,12 +56,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
         rest = model.rest_strain[k]
         w1 = real(0.5) * wp.dot(kb, a1 + b1)
         w2 = real(0.5) * wp.dot(kb, a2 + b2)
-        stiffness = model.bending_rigidity[k] / h
+        stiffness = model.bending_rigidity[k] * per_length
         m1 = stiffness * (w1 - rest[0])
         m2 = stiffness * (w2 - rest[1])
-        m3 = model.twist_rigidity[k] / h * (twist - rest[2])
-        common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) / chi) * (t + u)
-        lever = ((a1 + b1) * m1 + (a2 + b2) * m2) / chi
+        m3 = model.twist_rigidity[k] * per_length * (twist - rest[2])
+        common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
+        lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
         state.joint_before[e] = (common + wp.cross(u, lever)) / state.length[e]
         state.joint_after[e] = (common - wp.cross(t, lever)) / state.length[e + 1]
         state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3

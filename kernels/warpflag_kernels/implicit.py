@@ -24,8 +24,8 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-# Largest error of a node over the mean of its flagellum. The mean is what is followed: contacts that open, close or pass
-# a vertex make single nodes jump, which does not add up.
+# Largest error of a node over the mean of its flagellum. The mean is what is followed: contacts that open, close or
+# pass a vertex make single nodes jump, which does not add up.
 PEAK = 2.0
 GAP_SHARE = 0.2  # of the error that a step may make, for what the contact law leaves over
 

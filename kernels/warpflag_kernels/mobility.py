@@ -77,16 +77,8 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
     module = p.module("mobility", pairs + ("_halves" if halves else ""))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
 
-    @wp.kernel(module=module)
-    def pack(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        e = wp.tid()
+    @wp.func(module=module)
+    def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
         x = state.position[e]
         force = state.force[e]
         if e == model.first_node[model.flagellum_of[e]]:
@@ -97,10 +89,17 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         s.fx[e] = force[0]
         s.fy[e] = force[1]
         s.fz[e] = force[2]
-        if wp.static(halves):
-            s.ux[e] = real(0.0)
-            s.uy[e] = real(0.0)
-            s.uz[e] = real(0.0)
+
+    @wp.kernel(module=module)
+    def pack(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        pack_node(model, state, s, wp.tid())
 
     @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
@@ -119,6 +118,13 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             return
         begin = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
+        i = begin
+        while i < end:
+            pack_node(model, state, s, i)
+            s.ux[i] = real(0.0)
+            s.uy[i] = real(0.0)
+            s.uz[i] = real(0.0)
+            i += 1
         i = begin
         while i < end:
             own = model.first_node[model.flagellum_of[i]]
@@ -191,10 +197,12 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
             return
         t = state.tangent[e]
+        square = real(1.0)
         if e + 1 < end:
-            t = wp.normalize(t + state.tangent[e + 1])
+            t += state.tangent[e + 1]
+            square = wp.dot(t, t)
         force = state.force[e]
-        along = wp.dot(t, force) * t
+        along = (wp.dot(t, force) / square) * t
         v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
         if wp.static(halves):
             v += model.pair_mobility[c] * vec3(s.ux[e], s.uy[e], s.uz[e])
@@ -228,8 +236,8 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     halves = sums_by_halves(model)
     kernels, device = _kernels(model.precision, model.switches.pairs, halves), model.device
     inputs = [model.data, state.data, state.pairs]
-    if model.switches.pairs != "none":
-        wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     if halves:
         wp.launch(kernels.add_rows, model.cell_count, inputs=inputs, device=device)
+    elif model.switches.pairs != "none":
+        wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)

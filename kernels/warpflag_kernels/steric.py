@@ -192,11 +192,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
         y = state.position[e]
         along = wp.clamp(wp.dot(y, axis), -model.body_half_length[c], model.body_half_length[c])
         away = y - along * axis
-        distance = wp.length(away)
-        gap = distance - model.body_radius[c]
-        magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
+        square = wp.dot(away, away)
+        reach = model.body_radius[c] + cutoff * model.steric_diameter[c]
         force = vec3(real(0.0))
-        if magnitude > real(0.0):
+        if square < reach * reach:  # few nodes are that near: only they pay for the root
+            distance = wp.sqrt(square)
+            gap = distance - model.body_radius[c]
+            magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
             force = (magnitude / distance) * away
         state.body_contact[e] = force
 
