@@ -340,131 +340,137 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             i += lanes
         worst = real(0.0)
         loaded = real(0.0)
-        if stop > begin:
-            worst, loaded = evaluate(model, state, contacts_in, band, near, law, c, lane, lanes)
+        before = infinite
+        shortened = real(1.0)
         iteration = int(0)
-        while worst > tolerance and iteration < iterations:
-            # GMRES for u, from zero.
-            norm = real(0.0)
-            i = begin + lane
-            while i < stop:
-                k = steric_stiffness(law.solved_gap[i], strength, diameter)
-                root = wp.sqrt(k / (real(1.0) + k * law.yielding[i]))
-                law.root[i] = root
-                b = -root * law.residual[i]
-                law.basis[own_basis + i - begin] = b
-                norm += b * b
-                i += lanes
-            norm = wp.sqrt(block_sum(law, norm, c, lane, lanes))
-            enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
-            h = hessenberg()
-            cosine = rotations()
-            sine = rotations()
-            right = rotations()
-            right[0] = norm
-            left = norm
-            n = int(0)
-            while n < directions and left > enough * norm:
-                # The direction's length, then its product.
-                at = own_basis + n * capacity
-                size = norm
-                if n > 0:
-                    size = h[n, n - 1]  # kept below the triangle
-                scale = real(1.0) / size
-                i = lane
-                while i < stop - begin:
-                    v = scale * law.basis[at + i]
-                    law.basis[at + i] = v
-                    law.load[begin + i] = law.root[begin + i] * v
-                    i += lanes
-                product(model, state, contacts_in, band, near, law, c, lane, lanes)
-                i = lane
-                while i < stop - begin:
-                    change = law.change[begin + i]
-                    law.moved[own_moved + n * capacity + i] = change
-                    root = law.root[begin + i]
-                    scaled = real(1.0) - root * root * law.yielding[begin + i]
-                    law.basis[at + capacity + i] = scaled * law.basis[at + i] + root * change
-                    i += lanes
-                m = int(0)
-                while m <= n:
-                    other = own_basis + m * capacity
-                    dot = real(0.0)
-                    i = lane
-                    while i < stop - begin:
-                        dot += law.basis[other + i] * law.basis[at + capacity + i]
-                        i += lanes
-                    dot = block_sum(law, dot, c, lane, lanes)
-                    i = lane
-                    while i < stop - begin:
-                        law.basis[at + capacity + i] = law.basis[at + capacity + i] - dot * law.basis[other + i]
-                        i += lanes
-                    h[m, n] = dot
-                    m += 1
-                size = real(0.0)
-                i = lane
-                while i < stop - begin:
-                    size += law.basis[at + capacity + i] * law.basis[at + capacity + i]
-                    i += lanes
-                size = wp.sqrt(block_sum(law, size, c, lane, lanes))
-                h[n + 1, n] = size
-                # Givens rotations turn the Hessenberg matrix into a triangle.
-                m = int(0)
-                while m < n:
-                    a = h[m, n]
-                    b = h[m + 1, n]
-                    h[m, n] = cosine[m] * a + sine[m] * b
-                    h[m + 1, n] = cosine[m] * b - sine[m] * a
-                    m += 1
-                a = h[n, n]
-                length = wp.sqrt(a * a + size * size)
-                cosine[n] = a / length
-                sine[n] = size / length
-                h[n, n] = length
-                right[n + 1] = -sine[n] * right[n]
-                right[n] = cosine[n] * right[n]
-                left = wp.abs(right[n + 1])
-                n += 1
-            y = vecd()
-            m = n - 1
-            while m >= 0:
-                value = right[m]
-                j = m + 1
-                while j < n:
-                    value -= h[m, j] * y[j]
-                    j += 1
-                y[m] = value / h[m, m]
-                m -= 1
-            i = lane
-            while i < stop - begin:
-                change = -law.residual[begin + i]
-                m = int(0)
-                while m < n:
-                    change -= y[m] * law.moved[own_moved + m * capacity + i]
-                    m += 1
-                gap = law.solved_gap[begin + i]
-                compliance = law.yielding[begin + i]
-                k = steric_stiffness(gap, strength, diameter)
-                alone = gap - compliance * steric_force(gap, strength, diameter)
-                alone += (real(1.0) + compliance * k) * change
-                change = settle(alone, compliance, strength, diameter) - gap
-                # Kept, should the step have to be shortened.
-                law.basis[own_basis + i] = change
-                law.solved_gap[begin + i] = gap + change
-                i += lanes
-            before = worst
+        halving = int(0)
+        going = wp.where(stop > begin, 1, 0)
+        while going != 0:
             worst, loaded = evaluate(model, state, contacts_in, band, near, law, c, lane, lanes)
-            halving = int(0)
-            shortened = real(1.0)
-            while not (worst < before) and halving < halvings and worst > tolerance:
+            if worst <= tolerance:
+                going = 0
+            elif iteration > 0 and not (worst < before) and halving < halvings:
                 shortened = real(0.5) * shortened
+                halving += 1
                 i = lane
                 while i < stop - begin:
                     law.solved_gap[begin + i] = law.solved_gap[begin + i] - shortened * law.basis[own_basis + i]
                     i += lanes
-                worst, loaded = evaluate(model, state, contacts_in, band, near, law, c, lane, lanes)
-                halving += 1
-            iteration += 1
+            elif iteration == iterations:
+                going = 0
+            else:
+                # GMRES for u, from zero.
+                norm = real(0.0)
+                i = begin + lane
+                while i < stop:
+                    k = steric_stiffness(law.solved_gap[i], strength, diameter)
+                    root = wp.sqrt(k / (real(1.0) + k * law.yielding[i]))
+                    law.root[i] = root
+                    b = -root * law.residual[i]
+                    law.basis[own_basis + i - begin] = b
+                    norm += b * b
+                    i += lanes
+                norm = wp.sqrt(block_sum(law, norm, c, lane, lanes))
+                enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
+                h = hessenberg()
+                cosine = rotations()
+                sine = rotations()
+                right = rotations()
+                right[0] = norm
+                left = norm
+                n = int(0)
+                while n < directions and left > enough * norm:
+                    # The direction's length, then its product.
+                    at = own_basis + n * capacity
+                    size = norm
+                    if n > 0:
+                        size = h[n, n - 1]  # kept below the triangle
+                    scale = real(1.0) / size
+                    i = lane
+                    while i < stop - begin:
+                        v = scale * law.basis[at + i]
+                        law.basis[at + i] = v
+                        law.load[begin + i] = law.root[begin + i] * v
+                        i += lanes
+                    product(model, state, contacts_in, band, near, law, c, lane, lanes)
+                    i = lane
+                    while i < stop - begin:
+                        change = law.change[begin + i]
+                        law.moved[own_moved + n * capacity + i] = change
+                        root = law.root[begin + i]
+                        scaled = real(1.0) - root * root * law.yielding[begin + i]
+                        law.basis[at + capacity + i] = scaled * law.basis[at + i] + root * change
+                        i += lanes
+                    m = int(0)
+                    while m <= n:
+                        other = own_basis + m * capacity
+                        dot = real(0.0)
+                        i = lane
+                        while i < stop - begin:
+                            dot += law.basis[other + i] * law.basis[at + capacity + i]
+                            i += lanes
+                        dot = block_sum(law, dot, c, lane, lanes)
+                        i = lane
+                        while i < stop - begin:
+                            law.basis[at + capacity + i] = law.basis[at + capacity + i] - dot * law.basis[other + i]
+                            i += lanes
+                        h[m, n] = dot
+                        m += 1
+                    size = real(0.0)
+                    i = lane
+                    while i < stop - begin:
+                        size += law.basis[at + capacity + i] * law.basis[at + capacity + i]
+                        i += lanes
+                    size = wp.sqrt(block_sum(law, size, c, lane, lanes))
+                    h[n + 1, n] = size
+                    # Givens rotations turn the Hessenberg matrix into a triangle.
+                    m = int(0)
+                    while m < n:
+                        a = h[m, n]
+                        b = h[m + 1, n]
+                        h[m, n] = cosine[m] * a + sine[m] * b
+                        h[m + 1, n] = cosine[m] * b - sine[m] * a
+                        m += 1
+                    a = h[n, n]
+                    length = wp.sqrt(a * a + size * size)
+                    cosine[n] = a / length
+                    sine[n] = size / length
+                    h[n, n] = length
+                    right[n + 1] = -sine[n] * right[n]
+                    right[n] = cosine[n] * right[n]
+                    left = wp.abs(right[n + 1])
+                    n += 1
+                y = vecd()
+                m = n - 1
+                while m >= 0:
+                    value = right[m]
+                    j = m + 1
+                    while j < n:
+                        value -= h[m, j] * y[j]
+                        j += 1
+                    y[m] = value / h[m, m]
+                    m -= 1
+                i = lane
+                while i < stop - begin:
+                    change = -law.residual[begin + i]
+                    m = int(0)
+                    while m < n:
+                        change -= y[m] * law.moved[own_moved + m * capacity + i]
+                        m += 1
+                    gap = law.solved_gap[begin + i]
+                    compliance = law.yielding[begin + i]
+                    k = steric_stiffness(gap, strength, diameter)
+                    alone = gap - compliance * steric_force(gap, strength, diameter)
+                    alone += (real(1.0) + compliance * k) * change
+                    change = settle(alone, compliance, strength, diameter) - gap
+                    # Kept, should the step have to be shortened.
+                    law.basis[own_basis + i] = change
+                    law.solved_gap[begin + i] = gap + change
+                    i += lanes
+                before = worst
+                shortened = real(1.0)
+                halving = 0
+                iteration += 1
         if lane == 0 and not (worst <= tolerance):
             law.failed[c] = 1
         meet()
