@@ -6,9 +6,11 @@ import math
 
 import numpy as np
 import pytest
+import warp as wp
+from warpflag_kernels import mobility
 
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
-from tests.oracles import dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
+from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
 from warpflag.drag import pair_radius
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
@@ -187,3 +189,65 @@ def test_drag_scales_with_viscosity_unless_it_is_given(device):
         assert getattr(thick, name) == pytest.approx(getattr(thin, name) / 10, rel=1e-10)
     given = {"fluid.viscosity": 1e-2, "fluid.drag_rotation": 5e-6}
     assert evaluated(with_values(scene, given), start, device).spins == pytest.approx(thin.spins * 1.26 / 5, rel=1e-10)
+
+
+# Other ways to the same numbers.
+
+
+def ragged(mode: str, precision: str) -> list:
+    """A batch of two, three and two flagella of unequal lengths, of other meshes and fluids."""
+    common = {"hydrodynamics.mode": mode}
+    unequal = {"flagellum.1.length": 1.2, "flagellum.1.segments": 5}
+    three = {"flagella.count": 3, "flagella.segment_length": 0.1, "flagellum.2.length": 0.7, "fluid.viscosity": 2e-3}
+    return [
+        touching_cell({**common, **unequal}, precision),
+        cell({**common, **three}, precision),
+        touching_cell({**common, "flagella.length": 0.4}, precision, separation=0.02),
+    ]
+
+
+def velocities(scenes: list, device: str, forces: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Velocities of nodes r_1..r_N of a batch under given forces, and whether the pair sum was taken by halves."""
+    starts = [shaken(scene, seed, node=0.002) for seed, scene in enumerate(scenes)]
+    sim = Simulation(scenes, device=device, starts=starts)
+    sim.evaluate()
+    model, state = sim.system.model, sim.system.state
+    state.data.active.fill_(1)
+    state.data.force.assign(forces[: model.element_count])
+    mobility.node_velocities(model, state)
+    free = np.setdiff1d(np.arange(model.element_count), model.data.first_node.numpy())
+    return state.data.velocity.numpy()[free].astype(np.float64), mobility.sums_by_halves(model)
+
+
+@pytest.mark.parametrize("mode", ["within", "between", "all"])
+def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypatch):
+    """Every pair once for both nodes, as on a CPU, where one thread takes a whole cell, or twice."""
+    if not wp.get_device(device).is_cpu:
+        pytest.skip("pairs are summed by halves on a CPU alone")
+    scenes, forces = ragged(mode, precision), np.random.default_rng(12).uniform(-1, 1, (200, 3))
+    by_halves, halves = velocities(scenes, device, forces)
+    with monkeypatch.context() as patch:
+        patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        gathered, other = velocities(scenes, device, forces)
+    assert halves and not other
+    # To round-off of the type.
+    assert np.abs(by_halves - gathered).max() < 20 * float(np.finfo(precision).eps) * np.abs(gathered).max()
+
+
+def test_fast_and_strict_builds_agree(device):
+    """Reassociation and fused operations change the last digits and nothing else: forces and velocities of a state in
+    contact, and where the nodes are after a millisecond in which the motors turn nine times."""
+    scene = touching_cell({"numerics.stepper": "implicit", "numerics.time_step": 5e-6})
+    start = shaken(scene, seed=3, node=1e-3, spin=0.01)
+    assert (contact_distances(start) < 0.0448).sum() > 10
+    fast, strict = (Simulation(scene, device=device, starts=start, strict=s) for s in (False, True))
+    a, b = fast.evaluate(), strict.evaluate()
+    for name in ("forces", "torques", "velocities", "spins", "body_force", "body_torque", "body_velocity", "body_spin"):
+        found, expected = getattr(a, name), getattr(b, name)
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max(), name
+    for sim in (fast, strict):
+        sim.advance(1e-3)
+    x, y = fast.cell_state(), strict.cell_state()
+    assert np.abs(x.positions - y.positions).max() < 1e-9 * np.abs(y.positions).max()
+    assert np.abs(x.directors - y.directors).max() < 1e-9
+    assert y.motor_angle.min() > 9 * 2 * math.pi
