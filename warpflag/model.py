@@ -208,7 +208,9 @@ def build_guard(model: DeviceModel, chart: Any) -> Any:
     g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
     if model.switches.steric:
         g.position = wp.clone(chart.base_position)
-        g.moved = wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device)
+        g.moved, g.shifted = (
+            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(2)
+        )
     return g
 
 

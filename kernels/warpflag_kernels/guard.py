@@ -59,6 +59,7 @@ def struct(p: Precision) -> Any:
         # Empty where nothing can cross.
         position: wp.array(dtype=vec3)  # [E], at the last check [um]
         moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
+        shifted: wp.array(dtype=real)  # [K], the same since the lists of neighbours were built [um]
 
     return Guard
 
@@ -70,6 +71,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Chart, Guard = chart_stage.struct(p), struct(p)
     twist_angle = frames.functions(p).twist_angle
     closest_parameters, next_near = steric.functions(p).closest_parameters, neighbours.functions(p).next_near
+    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
+    Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
+    flow_reach, contact_reach = wp.constant(real(neighbours.REACH)), wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
@@ -182,6 +186,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
         chart: Chart,
         guard: Guard,
+        near: Neighbours,
         # Out:
         control: Control,
     ):
@@ -198,20 +203,44 @@ def _kernels(p: Precision) -> SimpleNamespace:
         p1n = state.position[e - 1]
         q1n = state.position[e]
         middle = real(0.5) * (p1n + q1n)
+        # What can have met between the two looks stands in the lists, if nothing has moved far.
+        moved = real(0.0)
+        shifted = real(0.0)
+        other = model.first_flagellum[c]
+        while other < model.first_flagellum[c + 1]:
+            moved = wp.max(moved, guard.moved[other])
+            shifted = wp.max(shifted, guard.shifted[other])
+            other += 1
+        beyond = wp.max(flow_reach - real(0.5) * state.length[e], contact_reach * model.steric_diameter[c])
+        if real(2.0) * (moved + shifted) + touch < beyond + skin:
+            n = candidates(model, near, e)
+            i = int(0)
+            while i < n:
+                j = candidate(model, near, e, i)
+                i += 1
+                if j >= model.first_node[k + 1]:
+                    p2n = state.position[j - 1]
+                    q2n = state.position[j]
+                    away = middle - real(0.5) * (p2n + q2n)
+                    reach = real(0.5) * (state.length[e] + state.length[j]) + touch + real(2.0) * moved
+                    if wp.dot(away, away) < reach * reach and crossed(
+                        p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch
+                    ):
+                        wp.atomic_min(control.fault, c, crossing + e)
+            return
         other = k + 1
         while other < model.first_flagellum[c + 1]:
-            reach = real(0.5) * state.length[e] + touch + guard.moved[k] + guard.moved[other]
+            reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
             j = model.first_node[other] + 1
             end = model.first_node[other + 1]
             while j < end:
                 p2n = state.position[j - 1]
                 q2n = state.position[j]
                 distance = wp.length(middle - real(0.5) * (p2n + q2n))
-                if distance < reach + real(0.5) * state.length[j]:
-                    p2 = guard.position[j - 1]
-                    q2 = guard.position[j]
-                    if crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch):
-                        wp.atomic_min(control.fault, c, crossing + e)
+                if distance < reach + real(0.5) * state.length[j] and crossed(
+                    p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch
+                ):
+                    wp.atomic_min(control.fault, c, crossing + e)
                 j = next_near(state.length, j, end, distance, reach)
             other += 1
 
@@ -221,6 +250,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
+        near: Neighbours,
         # Out:
         guard: Guard,
     ):
@@ -229,10 +259,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[model.cell_of[e]] == 0:
             return
         moved = real(0.0)
+        shifted = real(0.0)
         while e < model.first_node[k + 1]:
             moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
+            shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
             e += 1
         guard.moved[k] = moved
+        guard.shifted[k] = shifted
 
     @wp.kernel(module=module)
     def remember(
@@ -262,8 +295,9 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
     if model.switches.steric:
-        moves = [model.data, state.data, guard]
+        moves = [model.data, state.data, state.neighbours, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
+        inputs = [model.data, state.data, chart, guard, state.neighbours, control]
         wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
 
 
