@@ -1,7 +1,6 @@
 """The contact law of an implicit step: forces at the contacts that agree with the gaps they lead to.
 
-A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda: B puts it on
-the nodes, the near field of the pair sum carries it on, the factorised system answers. The gaps obey
+With W the compliance (see `compliance`), the gaps obey
 
     gap = free + W (F(gap) - acting),
 
@@ -11,9 +10,6 @@ systems (1 + k^1/2 W k^1/2) u = -k^1/2 residual with the stiffness k = -dF/dgap:
 each in time proportional to the nodes and contacts. Contacts are soft against what they rest on over one step, so a
 few products are enough, however many contacts there are. An estimate w of a contact's own compliance scales the
 systems, and takes the steepness of F out of them: Newton's steps are straight in gap - w F(gap), not in the gap.
-
-One block of threads takes one cell: on CUDA its lanes share every loop and wait for each other between them, on a CPU
-a single lane does it all.
 """
 
 import functools
@@ -22,10 +18,10 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, near_field, steric
+from warpflag_kernels import banded, chain, compliance, contacts, near_field, steric
+from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-LANES = 128  # threads of a block on CUDA
 DIRECTIONS = 8  # of GMRES at most
 LEAST_REDUCTION, MOST_REDUCTION = 0.05, 0.003  # of the linear residual, at which GMRES stops
 ITERATIONS = 40  # of Newton's method
@@ -35,62 +31,19 @@ STIFFENING = 0.15  # of a contact's compliance from local drag, for what else ho
 DEEPEST = 0.9  # extrapolated gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
-@wp.func_native("WP_TILE_SYNC();")
-def meet():
-    """Lanes of a block wait for each other; what one has written the others read."""
-    ...
-
-
-@functools.cache
-def struct(p: Precision) -> Any:
-    """The struct `Law`: unknowns, work space and settings."""
-    real, vec3 = p.real, p.vec3
-    Increment, vec6 = chain.types(p).Increment, chain.types(p).vec6
-
-    @wp.struct
-    class Law:
-        # Per contact [capacity].
-        free_gap: wp.array(dtype=real)
-        solved_gap: wp.array(dtype=real)
-        residual: wp.array(dtype=real)
-        pressed: wp.array(dtype=real)  # force at the extrapolated pose [pN]
-        force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to; between solutions: force - pressed [pN]
-        change: wp.array(dtype=real)  # W load [um]
-        yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
-        root: wp.array(dtype=real)  # square root of the stiffness that a contact shows against it
-        basis: wp.array(dtype=real)  # [(DIRECTIONS + 1) * capacity], orthonormal
-        moved: wp.array(dtype=real)  # [DIRECTIONS * capacity], W k^1/2 basis
-        # Per element [E], flagellum [K], lane [C * LANES].
-        on_first: wp.array(dtype=vec3)  # of segment i [pN]
-        on_second: wp.array(dtype=vec3)
-        on_node: wp.array(dtype=vec3)
-        on_body: wp.array(dtype=vec6)  # [K]
-        answer: Increment  # Y load
-        partial: wp.array(dtype=real)  # of sums and maxima
-        # Per cell [C].
-        gain: wp.array(dtype=wp.float64)  # g
-        tolerance: wp.array(dtype=real)  # of a gap [um]
-        products: wp.array(dtype=wp.int32)  # with W, so far
-        failed: wp.array(dtype=wp.int32)  # 1: not solved
-
-    return Law
-
-
 @functools.cache
 def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    real = p.real
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
-    NearField, Increment, vec6 = near_field.struct(p), chain.types(p).Increment, chain.types(p).vec6
+    NearField, Increment = near_field.struct(p), chain.types(p).Increment
     vecd = wp.types.vector(DIRECTIONS, real)
     hessenberg = wp.types.matrix((DIRECTIONS + 1, DIRECTIONS), real)
     rotations = wp.types.vector(DIRECTIONS + 1, real)
     steric_force, steric_stiffness = steric.functions(p).steric_force, steric.functions(p).steric_stiffness
-    near_flow = near_field.functions(p).near_flow
-    body_mobility, solve_flagellum = banded.functions(p).body_mobility, banded.functions(p).solve_flagellum
-    lever = contacts.functions(p)
-    gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
+    gap_change = contacts.functions(p).gap_change
+    f = compliance.functions(p, pairs)
+    block_sum, block_max, product = f.block_sum, f.block_max, f.product
     directions, iterations, halvings = wp.constant(DIRECTIONS), wp.constant(ITERATIONS), wp.constant(HALVINGS)
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
     cutoff, linear_below = wp.constant(real(steric.CUTOFF)), wp.constant(real(steric.LINEAR_BELOW))
@@ -153,117 +106,6 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                 i = 20
             i += 1
         return gap
-
-    @wp.func(module=module)
-    def block_sum(law: Law, value: real, c: wp.int32, lane: wp.int32, lanes: wp.int32):
-        law.partial[c * lanes + lane] = value
-        meet()
-        total = real(0.0)
-        i = int(0)
-        while i < lanes:
-            total += law.partial[c * lanes + i]
-            i += 1
-        meet()
-        return total
-
-    @wp.func(module=module)
-    def block_max(law: Law, value: real, c: wp.int32, lane: wp.int32, lanes: wp.int32):
-        law.partial[c * lanes + lane] = value
-        meet()
-        largest = real(0.0)
-        i = int(0)
-        while i < lanes:
-            largest = wp.max(largest, law.partial[c * lanes + i])
-            i += 1
-        meet()
-        return largest
-
-    @wp.func(module=module)
-    def product(
-        model: Model,
-        state: State,
-        contacts_in: Contacts,
-        band: Band,
-        near: NearField,
-        law: Law,
-        c: wp.int32,
-        lane: wp.int32,
-        lanes: wp.int32,
-    ):
-        """W load into `change`, Y load into `answer`."""
-        meet()
-        k_begin = model.first_flagellum[c]
-        k_end = model.first_flagellum[c + 1]
-        begin = model.first_node[k_begin]
-        end = model.first_node[k_end]
-        e = begin + lane
-        while e < end:
-            on_first, on_second = segment_loads(contacts_in, law.load, e)
-            law.on_first[e] = on_first
-            law.on_second[e] = on_second
-            e += lanes
-        meet()
-        e = begin + lane
-        while e < end:
-            f = law.on_second[e]
-            if e + 1 < end:
-                f += law.on_first[e + 1]  # zero where the next element is a tripod
-            law.on_node[e] = f
-            e += lanes
-        meet()
-        gain = real(law.gain[c])
-        e = begin + lane
-        while e < end:
-            k = model.flagellum_of[e]
-            f = vec3(real(0.0))
-            if e > model.first_node[k]:
-                f = law.on_node[e]
-                if wp.static(pairs != "none"):
-                    t = state.tangent[e]
-                    if e + 1 < model.first_node[k + 1]:
-                        t = wp.normalize(t + state.tangent[e + 1])
-                    v = near_flow(near, law.on_node, e)
-                    along = wp.dot(t, v) * t
-                    f += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
-                f = gain * f
-            law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
-            e += lanes
-        meet()
-        weight = real(band.weight[c])
-        k = k_begin + lane
-        while k < k_end:
-            first = model.first_node[k]
-            solve_flagellum(model, band, k, law.answer)
-            back = vec6(real(0.0))
-            for j in range(3):
-                back += wp.transpose(band.from_body[3 * k + j]) * law.answer.node[first + j]
-            on_body = body_load(model, state, contacts_in, law.load, k, law.on_node[first])
-            law.on_body[k] = gain * on_body - weight * back
-            k += lanes
-        meet()
-        if lane == 0:
-            total = vec6(real(0.0))
-            k = k_begin
-            while k < k_end:
-                total += law.on_body[k]
-                k += 1
-            force = vec3(total[0], total[1], total[2])
-            torque = vec3(total[3], total[4], total[5])
-            rate = body_mobility(model, state, c, force, torque)
-            law.answer.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
-            law.products[c] += 1
-        meet()
-        body = law.answer.body[c]
-        e = begin + lane
-        while e < end:
-            law.answer.node[e] = law.answer.node[e] - band.body_columns[e] * body
-            e += lanes
-        meet()
-        i = contacts_in.first[c] + lane
-        stop = contacts_in.first[c] + contacts_in.count[c]
-        while i < stop:
-            law.change[i] = gap_change(model, state, contacts_in, i, law.answer)
-            i += lanes
 
     @wp.func(module=module)
     def evaluate(

@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, body, chain, contact_law, contacts, hessian, mobility
+from warpflag_kernels import banded, body, chain, compliance, contact_law, contacts, hessian, mobility
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
@@ -23,7 +23,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
-    Contacts, Law = contacts.struct(p), contact_law.struct(p)
+    Contacts, Law = contacts.struct(p), compliance.struct(p)
     segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
     variant = ("bearing" if bearing_torque else "") + ("touching" if touching else "")
     module = p.module("correction", variant)

@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contact_law, contacts, step_control
+from warpflag_kernels import banded, chain, compliance, contact_law, contacts, step_control
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels.chart import vec6d
 from warpflag_kernels.control import NO_FAULT, Control
@@ -56,7 +56,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
     Chart, Implicit = chart_stage.struct(p), struct(p)
     Band, Contacts = banded.types(p).Band, contacts.struct(p)
-    Law = contact_law.struct(p)
+    Law = compliance.struct(p)
     _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
     f = step_control.functions(p)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest

@@ -13,6 +13,7 @@ from warpflag_kernels import (
     body,
     chain,
     chart,
+    compliance,
     contact_law,
     contacts,
     control,
@@ -275,7 +276,7 @@ class ImplicitStepper:
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
         c.normal = zeros(total, p.vec3)
 
-        law = contact_law.struct(p)()
+        law = compliance.struct(p)()
         for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
             setattr(law, name, zeros(total, p.real))
         law.basis = zeros((contact_law.DIRECTIONS + 1) * total, p.real)
@@ -283,7 +284,7 @@ class ImplicitStepper:
         law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
         law.on_body = zeros(model.flagellum_count, chain.types(p).vec6)
         law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, chain.types(p).vec6)
-        law.partial = zeros(cells * contact_law.LANES, p.real)
+        law.partial = zeros(cells * compliance.LANES, p.real)
         law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
         law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
         return c, law
