@@ -24,8 +24,8 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 DIRECTIONS = 8  # of GMRES at most
 LEAST_REDUCTION, MOST_REDUCTION = 0.05, 0.003  # of the linear residual, at which GMRES stops
-ITERATIONS = 40  # of Newton's method
-HALVINGS = 8
+ITERATIONS = 60  # of Newton's method
+HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
 STIFFENING = 0.15  # of a contact's compliance from local drag, for what else holds it
 DEEPEST = 0.9  # extrapolated gaps count for no less: what overlaps deeply will have moved apart [sigma]
