@@ -141,7 +141,7 @@ def build_state(model: DeviceModel) -> DeviceState:
     near = structs(p).Neighbours()
     if model.switches.steric:
         near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
-        near.moved, near.stale = zeros(flagella, p.real), zeros(cells, wp.int32)
+        near.left, near.stale = zeros(flagella, wp.int32), zeros(cells, wp.int32)
         near.count, near.segment = zeros(elements, wp.int32), zeros(elements * neighbours.SLOTS, wp.int32)
     return DeviceState(s, pairs, near)
 

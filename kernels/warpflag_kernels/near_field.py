@@ -77,9 +77,12 @@ def _kernels(p: Precision, pairs: str, steric: bool) -> SimpleNamespace:
     module = p.module("near_field", pairs + ("_steric" if steric else ""))
 
     @wp.func(module=module)
-    def loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
-        """Whether contact forces can act on node e of a flagellum that ends before `end`."""
-        if contacts_in.stop[e] > contacts_in.start[e] or contacts_in.head[e] >= 0:
+    def loaded_by_segments(contacts_in: Contacts, e: wp.int32, end: wp.int32):
+        """Whether other segments, but not the body, can load node e of a flagellum that ends before `end`."""
+        last = contacts_in.stop[e] - 1  # a node's contact with the body is the last it lists
+        if last >= contacts_in.start[e] and contacts_in.other[last] < 0:
+            return False
+        if last >= contacts_in.start[e] or contacts_in.head[e] >= 0:
             return True
         return e + 1 < end and (contacts_in.stop[e + 1] > contacts_in.start[e + 1] or contacts_in.head[e + 1] >= 0)
 
@@ -144,7 +147,7 @@ def _kernels(p: Precision, pairs: str, steric: bool) -> SimpleNamespace:
             while i >= 0 and coupled > 0:
                 j = contacts_in.segment[i]
                 if j != e:
-                    add(model, state, near, c, e, j, real(1.0) - taper(state, e, j))
+                    add(model, state, near, c, e, j, real(1.0))
                 i = contacts_in.next[i]
             k += 1
         if wp.static(within):
@@ -152,7 +155,7 @@ def _kernels(p: Precision, pairs: str, steric: bool) -> SimpleNamespace:
             j = wp.max(e - span, first + 1)
             while j <= e + span and j < end:
                 weight = taper(state, e, j)
-                if j != e and weight > real(0.0) and loaded(contacts_in, j, end):
+                if j != e and weight > real(0.0) and loaded_by_segments(contacts_in, j, end):
                     add(model, state, near, c, e, j, weight)
                 j += 1
         if wp.static(between and steric):
@@ -163,7 +166,9 @@ def _kernels(p: Precision, pairs: str, steric: bool) -> SimpleNamespace:
                 i += 1
                 if j >= 0:
                     weight = taper(state, e, j)
-                    if weight > real(0.0) and loaded(contacts_in, j, model.first_node[model.flagellum_of[j] + 1]):
+                    if weight > real(0.0) and loaded_by_segments(
+                        contacts_in, j, model.first_node[model.flagellum_of[j] + 1]
+                    ):
                         add(model, state, near, c, e, j, weight)
 
     return SimpleNamespace(build=build)

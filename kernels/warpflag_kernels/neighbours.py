@@ -88,13 +88,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
         near: Neighbours,
     ):
         k = wp.tid()
-        largest = real(0.0)
+        left = int(0)
         e = model.first_node[k]
         while e < model.first_node[k + 1]:
             d = state.position[e] - near.position[e]
-            largest = wp.max(largest, wp.dot(d, d))
+            if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
+                left = 1
             e += 1
-        near.moved[k] = largest
+        near.left[k] = left
 
     @wp.kernel(module=module)
     def judge(
@@ -104,12 +105,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
         near: Neighbours,
     ):
         c = wp.tid()
-        largest = real(0.0)
+        stale = int(0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
-            largest = wp.max(largest, near.moved[k])
+            stale = wp.max(stale, near.left[k])
             k += 1
-        near.stale[c] = wp.where(real(4.0) * largest < skin * skin, 0, 1)  # 1 for NaN
+        near.stale[c] = stale
 
     @wp.kernel(module=module)
     def build(

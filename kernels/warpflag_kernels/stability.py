@@ -51,6 +51,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def schedule(
+        # Model:
+        model: Model,
         # State:
         state: State,
         steps: wp.array(dtype=wp.int32),
@@ -60,7 +62,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = wp.tid()
         stability.active[c] = state.active[c]
         look = int(0)
-        if state.active[c] != 0 and (steps[c] < first_looks or steps[c] % interval == 0):
+        crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
+        if crowd and state.active[c] != 0 and (steps[c] < first_looks or steps[c] % interval == 0):
             look = 1
             stability.due[0] = 1
         stability.look[c] = look
@@ -139,12 +142,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def schedule(model: DeviceModel, state: DeviceState, steps: Any, stability: Any) -> None:
-    """Which cells measure in this pass, into `look` and `due`.
+    """Which cells measure in this pass, into `look` and `due`: those of three flagella or more, now and then.
 
     Args:
         steps: taken by every cell so far, shape [cell_count].
     """
-    inputs = [state.data, steps, stability]
+    inputs = [model.data, state.data, steps, stability]
     wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
 
 

@@ -159,7 +159,7 @@ def structs(p: Precision) -> SimpleNamespace:
     @wp.struct
     class Neighbours:
         position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
-        moved: wp.array(dtype=real)  # [K], largest square of a node's way since [um^2]
+        left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
         stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
         segment: wp.array(dtype=wp.int32)  # [E * SLOTS]

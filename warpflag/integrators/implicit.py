@@ -210,7 +210,8 @@ class ImplicitStepper:
         )  # fmt: skip
 
     def restart(self) -> None:
-        self.data.over_implicit.fill_(OVER_IMPLICIT_CROWD if self._crowded else stability.LEAST)
+        counts = np.diff(self._system.model.data.first_flagellum.numpy())
+        self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
         self.data.history.zero_()
         restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
@@ -250,8 +251,8 @@ class ImplicitStepper:
         s.probe = self._probe
         # A direction with a share of every mode: random, but the same in every run and every cell.
         cell_first = first_node[first_flagellum]
-        probe = [np.random.default_rng(0).standard_normal((n, 4)) for n in np.diff(cell_first)]
-        s.probe.node.assign(np.concatenate(probe) / np.sqrt(model.element_count))
+        probe = [np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in np.diff(cell_first)]
+        s.probe.node.assign(np.concatenate(probe))
         return s
 
     def _contact_arrays(self) -> tuple[Any, Any]:
