@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
+from warpflag_kernels import mobility
 
 from tests.helpers import cell
 from warpflag.simulation import Simulation
@@ -27,6 +28,7 @@ SWITCHES = {
     },
 }
 STEPPERS = ("rkc", "euler", "implicit")
+CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
 VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("implicit", "none")]
 
@@ -41,14 +43,23 @@ def kernels_in_source() -> set[tuple[str, str]]:
     return found
 
 
-def launched(monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any]) -> set[Any]:
-    """Kernels that a run of this kind launches, without compiling or running one."""
+def launched(
+    monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any], halves: bool = False
+) -> set[Any]:
+    """Kernels that a run of this kind launches, without compiling or running one.
+
+    halves: with the pair sum as a CPU takes it.
+    """
     kernels = set()
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
-    sim = Simulation(scene, device="cpu")
-    sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
     with monkeypatch.context() as patch:
+        if not halves:
+            patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        sim = Simulation(scene, device="cpu")
+        sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
+        if stepper == "implicit":
+            sim.stepper.stability.due.fill_(1)
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.add(kernel))
         patch.setattr(wp, "launch_tiled", lambda kernel, *_args, **_options: kernels.add(kernel))
         sim.stepper.launch_pass()
@@ -66,9 +77,11 @@ def without_precision() -> set[Any]:
 
 def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole = set().union(*(launched(monkeypatch, precision, stepper, {}) for stepper in STEPPERS))
+    whole |= launched(monkeypatch, precision, "implicit", CROWD)
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     once = without_precision()
-    used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once}
+    on_cpu = launched(monkeypatch, precision, "rkc", {}, halves=True)
+    used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.
     targets = {kernel.module: [80] if precision == "float64" else [90] for kernel in reduced}
