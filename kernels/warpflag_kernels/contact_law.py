@@ -22,8 +22,9 @@ from warpflag_kernels import banded, chain, compliance, contacts, near_field, st
 from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-DIRECTIONS = 8  # of GMRES at most
-LEAST_REDUCTION, MOST_REDUCTION = 0.05, 0.003  # of the linear residual, at which GMRES stops
+DIRECTIONS = 10  # of GMRES at most
+LEAST_REDUCTION, MOST_REDUCTION = 0.05, 0.001  # of the linear residual, at which GMRES stops
+PATIENCE = 4  # iterations of Newton's method after which it does not stop early: contacts are very stiff
 ITERATIONS = 60  # of Newton's method
 HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
@@ -45,6 +46,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
     f = compliance.functions(p, pairs)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
     directions, iterations, halvings = wp.constant(DIRECTIONS), wp.constant(ITERATIONS), wp.constant(HALVINGS)
+    patience = wp.constant(PATIENCE)
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
     cutoff, linear_below = wp.constant(real(steric.CUTOFF)), wp.constant(real(steric.LINEAR_BELOW))
     settled = wp.constant(real(0.1 * FINEST))
@@ -213,7 +215,9 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                     norm += b * b
                     i += lanes
                 norm = wp.sqrt(block_sum(law, norm, c, lane, lanes))
-                enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
+                enough = most_reduction
+                if iteration < patience:
+                    enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
                 h = hessenberg()
                 cosine = rotations()
                 sine = rotations()

@@ -237,7 +237,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             k += 1
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
-        if accept(steps, c, dt, error, sound, imp.history[c] == 2):
+        if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
             imp.accepted[c] = 1
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt

@@ -32,6 +32,7 @@ EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 SAFETY = 1.15
 FIRST_PROBES = 40
+NOISE = 20.0  # times the usual round-off of an error estimate, above which there is certainly more in it
 # A state this stiff is past saving: the step is taken, unstable, and the guards stop the cell.
 MOST_STAGES = 1.0e4
 
@@ -56,6 +57,7 @@ def struct(p: Precision) -> Any:
         probe_norm: wp.array(dtype=wp.float64)  # [C]
         probe_sum: wp.array(dtype=wp.float64)  # [K], squared norm of the flagellum's part
         error: wp.array(dtype=real)  # [K], largest node error estimate [um]
+        noise: wp.array(dtype=real)  # [K], below which it is lost in round-off [um]
         spectral_radius: wp.array(dtype=wp.float64)  # [C] [1/s]
         coefficients: wp.array(dtype=wp.vec4d)  # [C]: mu, nu, and m dt, g dt [s]
         evaluations: wp.array(dtype=wp.int32)  # [C], right-hand sides so far
@@ -237,12 +239,12 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             d = real(0.04) * dt * (rkc.start_rate[e] + chart.rate[e]) - real(0.08) * chart.increment[e]
             worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
             e += 1
-        # Rates carry the round-off of positions times the stiffness of the stretch: below seven times the usual an
+        # Rates carry the round-off of positions times the stiffness of the stretch: below NOISE times the usual an
         # estimate means nothing.
         reach = real(last - model.first_node[k]) * model.segment_length[k]
         force = epsilon * reach * model.stretching_stiffness[k] / model.segment_length[k]
-        noise = real(0.28) * dt * model.mobility_along[last] * force
-        rkc.error[k] = wp.where(worst < noise, real(0.0), worst)
+        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.mobility_along[last] * force
+        rkc.error[k] = worst
 
     @wp.kernel(module=module)
     def decide(
@@ -260,12 +262,14 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
         error = wp.float64(0.0)
+        noise = wp.float64(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             error = wp.max(error, wp.float64(rkc.error[k]))
+            noise = wp.max(noise, wp.float64(rkc.noise[k]))
             k += 1
         sound = control.fault[c] == no_fault and wp.isfinite(error)
-        if not accept(steps, c, control.step[c], error, sound, True) and control.step[c] > smallest:
+        if not accept(steps, c, control.step[c], error, noise, sound, True) and control.step[c] > smallest:
             control.fault[c] = no_fault
             chart.commit[c] = 0
             chart.rest[c] = 0

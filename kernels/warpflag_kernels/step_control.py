@@ -17,6 +17,7 @@ LARGEST_GROWTH = 1.9  # of the step from one to the next; variable-step BDF2 is 
 REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]
+FORGOTTEN = 0.02  # of that time: a mean of estimates that fade without new ones counts no longer
 JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
 SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below
 ROUND_OFF = {"float64": 1.0e-14, "float32": 3.0e-7}  # of an error estimate [um]
@@ -41,15 +42,25 @@ def functions(p: Precision) -> SimpleNamespace:
     module = p.module("step_control")
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
+    forgotten = wp.constant(wp.float64(FORGOTTEN * MEMORY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
     jump, shortest = (wp.constant(wp.float64(x)) for x in (JUMP, SHORTEST_STEP))
 
     @wp.func(module=module)
-    def accept(control: StepControl, c: wp.int32, dt: wp.float64, error: wp.float64, sound: wp.bool, known: wp.bool):
+    def accept(
+        control: StepControl,
+        c: wp.int32,
+        dt: wp.float64,
+        error: wp.float64,
+        lost: wp.float64,
+        sound: wp.bool,
+        known: wp.bool,
+    ):
         """Whether a step counts; sets the next one.
 
         Args:
             error: estimate of this step [um]; `known` says whether there is one.
+            lost: an estimate below this is lost in round-off, and only says that it is below [um].
             sound: the step was solved and violates no guard.
         """
         one = wp.float64(1.0)
@@ -62,14 +73,23 @@ def functions(p: Precision) -> SimpleNamespace:
             jumps = before > wp.float64(0.0) and error > jump * before
             good = sound and (error < refused * tolerance * dt or jumps or dt <= shortest)
             if good and not jumps:
-                level = wp.log(wp.max(error, round_off) / (dt * dt * dt))
-                # An estimate lost in round-off is a bound from above; longer steps will tell.
-                seen = error > round_off
+                bound = wp.max(error, wp.max(lost, round_off))
+                level = wp.log(bound / (dt * dt * dt))
+                fade = wp.exp(-dt / memory)
+                seen = error >= bound
+                # What is lost in round-off lowers the mean at most; longer steps will tell. But where round-off hides
+                # all that is allowed, the mean of what was seen holds, until nothing has confirmed it for long.
+                hidden = lost > tolerance * dt
                 if seen or level * control.error_time[c] < control.error_sum[c]:
-                    fade = wp.exp(-dt / memory)
                     control.error_sum[c] = fade * control.error_sum[c] + level * dt
                     control.error_time[c] = fade * control.error_time[c] + dt
-                if seen:
+                elif hidden:
+                    control.error_sum[c] = fade * control.error_sum[c]
+                    control.error_time[c] = fade * control.error_time[c]
+                    if control.error_time[c] < forgotten:
+                        control.error_sum[c] = wp.float64(0.0)
+                        control.error_time[c] = wp.float64(0.0)
+                if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
                     factor = wp.min(growth, wp.max(wp.sqrt(safety * tolerance / level), shortest) / dt)
                 if factor > wp.float64(0.8) and factor < wp.float64(1.25):

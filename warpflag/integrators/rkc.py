@@ -63,7 +63,7 @@ class RkcStepper:
         r.evaluations = zeros(cells, wp.int32)
         r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
         r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
-        r.error = zeros(flagella, p.real)
+        r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
         self.data = r
         fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or 0.0 for f, s in zip(fixed, scenes, strict=True)]
