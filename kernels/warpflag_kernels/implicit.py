@@ -26,7 +26,7 @@ from warpflag_kernels.types import Precision, structs
 
 # Largest error of a node over the mean of its flagellum. The mean is what is followed: contacts that open, close or
 # pass a vertex make single nodes jump, which does not add up.
-PEAK = 2.0
+PEAK = 2.5
 GAP_SHARE = 0.05  # of the error that a step may make, for what the contact law leaves over
 
 
