@@ -3,11 +3,12 @@
 With delta the last increment, w = dt/dt_last, A = (1 + 2w)/(1 + w) and g = 1/A, a step extrapolates by x = w delta,
 evaluates the velocities V there once, and solves for the correction e:
 
-    (1/dt + g M H) e = g [V - w delta/dt] + contact forces
+    (1/dt + g M H) e = g [V - w delta/dt] + g M B (F - F_x)
 
 in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
-the explicit flows of the pair sum stable. Contact forces are those of the exact law at the end of the step. Every
-step is checked before it is taken: solves, guards and the error estimate. A step that fails is taken again, shorter.
+the explicit flows of the pair sum stable. V holds the contact forces F_x at the extrapolated gaps; those that count,
+F, obey the exact law at the end of the step. Every step is checked before it is taken: solves, guards and the error
+estimate. A step that fails is taken again, shorter.
 """
 
 import functools
