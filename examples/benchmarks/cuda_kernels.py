@@ -32,6 +32,7 @@ import warpflag_kernels
 from cells import spread
 from cubin import Usage, usage
 from harness import table
+from warpflag_kernels import mobility
 
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
@@ -41,22 +42,25 @@ STEPPERS = ("rkc", "euler", "implicit")
 
 @contextmanager
 def collected() -> Iterator[set[Any]]:
-    """Kernels that are launched meanwhile, of which none is compiled or run."""
+    """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+    by_halves = mobility.sums_by_halves
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
+        mobility.sums_by_halves = lambda _model: False  # which is for a CPU
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
+        mobility.sums_by_halves = by_halves
 
 
 def launched(precision: str, stepper: str) -> set[Any]:
     """Kernels of a run with every term of the model."""
     values = {"numerics.stepper": stepper} | ({} if stepper == "euler" else {"numerics.accuracy": 1e-3})
-    sim = Simulation(with_values(spread(2, 10, precision), values), device="cpu")
+    sim = Simulation(with_values(spread(3, 10, precision), values), device="cpu")
     sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
     with collected() as kernels:
         sim.stepper.launch_pass()

@@ -70,7 +70,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
     twist_angle = frames.functions(p).twist_angle
-    closest_parameters, next_near = steric.functions(p).closest_parameters, neighbours.functions(p).next_near
+    closest_parameters = steric.functions(p).closest_parameters
     candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
     flow_reach, contact_reach = wp.constant(real(neighbours.REACH)), wp.constant(real(neighbours.CONTACT_REACH))
@@ -212,37 +212,27 @@ def _kernels(p: Precision) -> SimpleNamespace:
             shifted = wp.max(shifted, guard.shifted[other])
             other += 1
         beyond = wp.max(flow_reach - real(0.5) * state.length[e], contact_reach * model.steric_diameter[c])
-        if real(2.0) * (moved + shifted) + touch < beyond + skin:
+        later = model.first_node[k + 1]
+        listed = real(2.0) * (moved + shifted) + touch < beyond + skin
+        n = model.first_node[model.first_flagellum[c + 1]] - later
+        if listed:
             n = candidates(model, near, e)
-            i = int(0)
-            while i < n:
+        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
+        i = int(0)
+        while i < n:
+            j = later + i
+            if listed:
                 j = candidate(model, near, e, i)
-                i += 1
-                if j >= model.first_node[k + 1]:
-                    p2n = state.position[j - 1]
-                    q2n = state.position[j]
-                    away = middle - real(0.5) * (p2n + q2n)
-                    reach = real(0.5) * (state.length[e] + state.length[j]) + touch + real(2.0) * moved
-                    if wp.dot(away, away) < reach * reach and crossed(
-                        p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch
-                    ):
-                        wp.atomic_min(control.fault, c, crossing + e)
-            return
-        other = k + 1
-        while other < model.first_flagellum[c + 1]:
-            reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
-            j = model.first_node[other] + 1
-            end = model.first_node[other + 1]
-            while j < end:
+            i += 1
+            if j >= later and j > model.first_node[model.flagellum_of[j]]:
                 p2n = state.position[j - 1]
                 q2n = state.position[j]
-                distance = wp.length(middle - real(0.5) * (p2n + q2n))
-                if distance < reach + real(0.5) * state.length[j] and crossed(
+                away = middle - real(0.5) * (p2n + q2n)
+                within = reach + real(0.5) * state.length[j]
+                if wp.dot(away, away) < within * within and crossed(
                     p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch
                 ):
                     wp.atomic_min(control.fault, c, crossing + e)
-                j = next_near(state.length, j, end, distance, reach)
-            other += 1
 
     @wp.kernel(module=module)
     def measure_moves(
