@@ -62,6 +62,8 @@ def launched(precision: str, stepper: str) -> set[Any]:
     values = {"numerics.stepper": stepper} | ({} if stepper == "euler" else {"numerics.accuracy": 1e-3})
     sim = Simulation(with_values(spread(3, 10, precision), values), device="cpu")
     sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
+    if stepper == "implicit":
+        sim.stepper.stability.due.fill_(1)
     with collected() as kernels:
         sim.stepper.launch_pass()
         sim.evaluate()

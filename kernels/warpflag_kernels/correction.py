@@ -143,7 +143,6 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         law: Law,
         drive: Increment,
         x: Increment,
-        relax: real,
         # Out:
         rho: Increment,
     ):
@@ -169,8 +168,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
             u = state.body_velocity[c]
             w = state.body_spin[c]
             rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
-            rho.body[c] = relax * (drive.body[c] + gain * rate - inv_dt * x.body[c])
-        rho.node[e] = relax * vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+            rho.body[c] = drive.body[c] + gain * rate - inv_dt * x.body[c]
+        rho.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)
     def add(
@@ -239,13 +238,8 @@ def defect(
     x: Any,
     rho: Any,
     contacts_in: Any = None,
-    relax: float = 1.0,
 ) -> None:
-    """D^-1 times the residual of the full equations at x, into rho; without contact forces where there is no list.
-
-    Args:
-        relax: a factor of the residual.
-    """
+    """D^-1 times the residual of the full equations at x, into rho; without contact forces where there is no list."""
     touching = contacts_in is not None
     kernels, device = _kernels(model.precision, model.switches.bearing_torque, touching), model.device
     listed = contacts_in if touching else contacts.struct(model.precision)()
@@ -256,5 +250,5 @@ def defect(
     wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=device)
     body.move_bodies(model, state)
     mobility.node_velocities(model, state)
-    inputs = [model.data, state.data, band, law, drive, x, relax, rho]
+    inputs = [model.data, state.data, band, law, drive, x, rho]
     wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)

@@ -19,7 +19,7 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
 SHARE = 0.65  # of kappa that the over-implicitness takes
 FALL = 0.9  # of it from one look to the next at least: a power iteration comes from below
-MOST = 5.0
+MOST = 5.0  # beyond, one correction leaves too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at
 INTERVAL = 8  # steps between two looks later
 
@@ -171,7 +171,8 @@ def measure(
     """
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
-    correction.defect(model, state, stiffness, band, law, nothing, stability.probe, answer, relax=-1.0)
+    # The defect of the probe alone is the product with its sign changed, which a power iteration does not mind.
+    correction.defect(model, state, stiffness, band, law, nothing, stability.probe, answer)
     banded.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)

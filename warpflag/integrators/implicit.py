@@ -91,7 +91,6 @@ class ImplicitStepper:
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
         self._free_step, self._step = increment(), increment()
-        self._nothing, self._probe = increment(), increment()
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
         self._sweeps = SWEEPS
 
@@ -126,7 +125,10 @@ class ImplicitStepper:
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
         self.steps = build_step_control(accuracies, device)
-        self.stability = self._stability_arrays()
+        # Three flagella or more need their over-implicitness measured.
+        self.stability: Any = None
+        if model.switches.pairs != "none" and max(len(s.resolved_flagella()) for s in scenes) > 2:
+            self._nothing, self.stability = increment(), self._stability_arrays(increment())
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -174,7 +176,7 @@ class ImplicitStepper:
         chart.commit(model, state, s.chart)
         guard.remember(model, state, s.chart, s.guard, s.control)
         inputs = [state.data, *moved, i, self._last, self._before, s.control]
-        if self._crowded:
+        if self.stability is not None:
             stability.schedule(model, state, i.evaluations, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
@@ -219,12 +221,12 @@ class ImplicitStepper:
         names = ("last_step", "step_before", "history", "evaluations", "over_implicit")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
-        for name, x in (("last", self._last), ("before", self._before), ("probe", self._probe)):
+        for name, x in self._increments_kept().items():
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
-        carried = {"last": self._last, "before": self._before, "probe": self._probe}
+        carried = self._increments_kept()
         for name, values in memory.items():
             whose, _, part = name.partition("_")
             if part in ("node", "body"):
@@ -232,27 +234,29 @@ class ImplicitStepper:
             else:
                 getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
 
-    def _stability_arrays(self) -> Any:
-        """Of cells with three flagella or more; fewer need no measurement."""
+    def _increments_kept(self) -> dict[str, Any]:
+        """Increments that a resumed run needs."""
+        kept = {"last": self._last, "before": self._before}
+        return kept if self.stability is None else {**kept, "probe": self.stability.probe}
+
+    def _stability_arrays(self, probe: Any) -> Any:
+        """What the measurement keeps.
+
+        probe: an increment, filled here with a direction that has a share of every mode: random, but the same in every
+        run and every cell.
+        """
         model = self._system.model
-        first_flagellum, first_node = model.data.first_flagellum.numpy(), model.data.first_node.numpy()
-        self._crowded = model.switches.pairs != "none" and int(np.diff(first_flagellum).max()) > 2
-
-        def zeros(count: int, dtype: Any) -> wp.array:
-            return wp.zeros(count if self._crowded else 1, dtype=dtype, device=model.device)
-
+        cells, device = model.cell_count, model.device
         s = stability.struct(model.precision)()
-        s.kappa, s.size = zeros(model.cell_count, wp.float64), zeros(model.flagellum_count, wp.float64)
-        s.look, s.active, s.due = (
-            zeros(model.cell_count, wp.int32),
-            zeros(model.cell_count, wp.int32),
-            zeros(1, wp.int32),
+        s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
+        s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
+        s.look, s.active = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+        s.due = wp.zeros(1, dtype=wp.int32, device=device)
+        nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+        probe.node.assign(
+            np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes])
         )
-        s.probe = self._probe
-        # A direction with a share of every mode: random, but the same in every run and every cell.
-        cell_first = first_node[first_flagellum]
-        probe = [np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in np.diff(cell_first)]
-        s.probe.node.assign(np.concatenate(probe))
+        s.probe = probe
         return s
 
     def _contact_arrays(self) -> tuple[Any, Any]:
