@@ -1,6 +1,6 @@
 """The implicit stepper at the extremes: right, or stopped with a reason, but never finite garbage.
 
-    uv run examples/benchmarks/extremes.py                 every case, a few minutes
+    uv run examples/benchmarks/extremes.py                 every case, about a minute
     uv run examples/benchmarks/extremes.py --cases "T x 3" hairpin
 
 Every case changes one thing about the zipping cell and runs a short time at the default accuracy. The same start is

@@ -1,6 +1,6 @@
 """The power balance of a whole run: what the motors do is dissipated or stored, to the accuracy of the steps.
 
-    uv run examples/benchmarks/power_balance.py                      zipping, 15 ms, about two minutes
+    uv run examples/benchmarks/power_balance.py                      zipping, 15 ms, a few minutes
     uv run examples/benchmarks/power_balance.py --duration 4e-3
 
 Motor work: torque times the angle that the motor has turned relative to the body, as recorded. Dissipation: the work of
