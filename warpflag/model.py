@@ -104,6 +104,7 @@ def build_model(scenes: Sequence[Scene], device: Any, precision: Precision) -> D
         cell_count=len(scenes),
         flagellum_count=len(flagella),
         element_count=len(flagellum_of),
+        largest_cell=int(np.bincount(owner, nodes - 1).max()),
         data=m,
     )
 

@@ -41,7 +41,7 @@ def types(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     t = types(p)
     Pose, Increment, vec6 = t.Pose, t.Increment, t.vec6
@@ -49,7 +49,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     f, fd = frames.functions(p), frames.functions(Precision("float64", p.strict))
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     rotation_vector_quat, rotation_vector_quatd = f.rotation_vector_quat, fd.rotation_vector_quat
-    module = p.module("chain")
+    module = p.module("chain", "carrying" if carrying else "")
 
     @wp.func(module=module)
     def node_part(x: vec4):
@@ -117,12 +117,17 @@ def _kernels(p: Precision) -> SimpleNamespace:
         end.director[first] = perpendicular_unit(director, m)
         end.length[first] = real(1.0)
         x_before = s * anchor_part(x.body[c], y_old)
-        a_before = anchor_part(a.body[c], y_old)
-        b_before = anchor_part(b.body[c], y_old)
-        a_new = anchor_part(a.body[c], y)
-        b_new = anchor_part(b.body[c], y)
-        a_out.node[first] = a.node[first]
-        b_out.node[first] = b.node[first]
+        a_before = vec3(real(0.0))
+        b_before = vec3(real(0.0))
+        a_new = vec3(real(0.0))
+        b_new = vec3(real(0.0))
+        if wp.static(carrying):
+            a_before = anchor_part(a.body[c], y_old)
+            b_before = anchor_part(b.body[c], y_old)
+            a_new = anchor_part(a.body[c], y)
+            b_new = anchor_part(b.body[c], y)
+            a_out.node[first] = a.node[first]
+            b_out.node[first] = b.node[first]
         e = first + 1
         while e < model.first_node[k + 1]:
             segment = start.position[e] - y_old
@@ -141,16 +146,17 @@ def _kernels(p: Precision) -> SimpleNamespace:
             end.tangent[e] = t_new
             end.length[e] = wp.abs(stretch * length)
             end.director[e] = perpendicular_unit(rotation * start.director[e], t_new)
-            a_here = a.node[e]
-            b_here = b.node[e]
-            a_new += rotation * (node_part(a_here) - a_before)
-            b_new += rotation * (node_part(b_here) - b_before)
-            a_before = node_part(a_here)
-            b_before = node_part(b_here)
-            a_out.node[e] = vec4(a_new[0], a_new[1], a_new[2], a_here[3])
-            b_out.node[e] = vec4(b_new[0], b_new[1], b_new[2], b_here[3])
+            if wp.static(carrying):
+                a_here = a.node[e]
+                b_here = b.node[e]
+                a_new += rotation * (node_part(a_here) - a_before)
+                b_new += rotation * (node_part(b_here) - b_before)
+                a_before = node_part(a_here)
+                b_before = node_part(b_here)
+                a_out.node[e] = vec4(a_new[0], a_new[1], a_new[2], a_here[3])
+                b_out.node[e] = vec4(b_new[0], b_new[1], b_new[2], b_here[3])
             e += 1
-        if k == model.first_flagellum[c]:
+        if wp.static(carrying) and k == model.first_flagellum[c]:
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
 
@@ -158,16 +164,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def retract(
-    model: DeviceModel, state: Any, start: Any, scale: Any, x: Any, end: Any, carry: tuple[Any, Any, Any, Any]
+    model: DeviceModel, state: Any, start: Any, scale: Any, x: Any, end: Any, carry: tuple[Any, Any, Any, Any] | None = None
 ) -> None:
     """The pose `end` reached from `start` by the increment scale * x, and two increments carried along.
 
     Args:
         scale: per cell, shape [cell_count].
-        carry: increments a, b at `start` and where they go: (a, b, a_out, b_out); all four differ.
+        carry: increments a, b at `start` and where they go: (a, b, a_out, b_out); all four differ. None: just the pose.
     """
-    kernels = _kernels(model.precision)
-    a, b, a_out, b_out = carry
+    kernels = _kernels(model.precision, carry is not None)
+    a, b, a_out, b_out = carry or (x, x, x, x)
     inputs = [model.data, state.data, start, scale, x, end]
     wp.launch(kernels.retract_bodies, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, start, scale, x, a, b, end, a_out, b_out]

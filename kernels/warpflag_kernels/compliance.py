@@ -1,7 +1,7 @@
 """How the contacts of a step answer to forces: products with the compliance W, without the matrix.
 
 A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda. B puts it on
-the nodes, the near field of the pair sum carries it on, the factorised system answers, and the gaps are read off; in
+the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off; in
 time proportional to nodes and contacts.
 
 One block of threads takes one cell: on CUDA its lanes share every loop and wait for each other between them, on a CPU
@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contacts, near_field
+from warpflag_kernels import banded, chain, contact_flow, contacts
 from warpflag_kernels.types import Precision, structs
 
 LANES = 128  # threads of a block on CUDA
@@ -38,9 +38,8 @@ def struct(p: Precision) -> Any:
         free_gap: wp.array(dtype=real)
         solved_gap: wp.array(dtype=real)
         residual: wp.array(dtype=real)
-        pressed: wp.array(dtype=real)  # force at the extrapolated pose [pN]
         force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to; between solutions: force - pressed [pN]
+        load: wp.array(dtype=real)  # what W is applied to [pN]
         change: wp.array(dtype=real)  # W load [um]
         yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
         root: wp.array(dtype=real)  # square root of the stiffness that a contact shows against it
@@ -63,20 +62,23 @@ def struct(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pairs: str) -> SimpleNamespace:
-    """Device functions of one block: sums and maxima over its lanes, and the product."""
+def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace:
+    """Device functions of one block of so many lanes: sums and maxima over them, and the product."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
-    NearField, vec6 = near_field.struct(p), chain.types(p).vec6
-    near_flow = near_field.functions(p).near_flow
+    ContactFlow, vec6 = contact_flow.struct(p), chain.types(p).vec6
+    flows = contact_flow.functions(p, pairs, form)
+    load, spread, flow_at = flows.load, flows.spread, flows.flow_at
     body_mobility, solve_flagellum = banded.functions(p).body_mobility, banded.functions(p).solve_flagellum
     lever = contacts.functions(p)
     gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
-    module = p.module("compliance", pairs)
+    module = p.module("compliance", f"{pairs}_{form}_{lanes}")
 
     @wp.func(module=module)
-    def block_sum(law: Law, value: real, c: wp.int32, lane: wp.int32, lanes: wp.int32):
+    def block_sum(law: Law, value: real, c: wp.int32, lane: wp.int32):
+        if wp.static(lanes == 1):
+            return value
         law.partial[c * lanes + lane] = value
         meet()
         total = real(0.0)
@@ -88,7 +90,9 @@ def functions(p: Precision, pairs: str) -> SimpleNamespace:
         return total
 
     @wp.func(module=module)
-    def block_max(law: Law, value: real, c: wp.int32, lane: wp.int32, lanes: wp.int32):
+    def block_max(law: Law, value: real, c: wp.int32, lane: wp.int32):
+        if wp.static(lanes == 1):
+            return value
         law.partial[c * lanes + lane] = value
         meet()
         largest = real(0.0)
@@ -105,11 +109,10 @@ def functions(p: Precision, pairs: str) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         band: Band,
-        near: NearField,
+        flow: ContactFlow,
         law: Law,
         c: wp.int32,
         lane: wp.int32,
-        lanes: wp.int32,
     ):
         """W load into `change`, Y load into `answer`."""
         meet()
@@ -130,8 +133,13 @@ def functions(p: Precision, pairs: str) -> SimpleNamespace:
             if e + 1 < end:
                 f += law.on_first[e + 1]  # zero where the next element is a tripod
             law.on_node[e] = f
+            if wp.static(pairs != "none"):
+                if e > model.first_node[model.flagellum_of[e]]:
+                    load(flow, flow.place[e], f)
             e += lanes
         meet()
+        if wp.static(form != "gathered"):
+            spread(model, flow, c)
         gain = real(law.gain[c])
         e = begin + lane
         while e < end:
@@ -143,7 +151,7 @@ def functions(p: Precision, pairs: str) -> SimpleNamespace:
                     t = state.tangent[e]
                     if e + 1 < model.first_node[k + 1]:
                         t = wp.normalize(t + state.tangent[e + 1])
-                    v = near_flow(near, law.on_node, e)
+                    v = flow_at(model, flow, e, k, c)
                     along = wp.dot(t, v) * t
                     f += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
                 f = gain * f

@@ -18,7 +18,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, compliance, contacts, near_field, steric
+from warpflag_kernels import banded, chain, compliance, contact_flow, contacts, steric
 from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
@@ -28,31 +28,61 @@ PATIENCE = 4  # iterations of Newton's method after which it does not stop early
 ITERATIONS = 60  # of Newton's method
 HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
+SETTLED = 1.0e-3  # change at which a contact's own Newton iteration has converged, the next would be its square [sigma]
 STIFFENING = 0.15  # of a contact's compliance from local drag, for what else holds it
 DEEPEST = 0.9  # extrapolated gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
+# Dot products with earlier directions, and their removal, are a vector loop only where the compiler is told that
+# directions do not overlap.
+_DOT = """
+    const REAL* __restrict__ A = law.basis.data + a; const REAL* __restrict__ B = law.basis.data + b;
+    REAL total = 0;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int i = lane; i < count; i += LANES) total += A[i] * B[i];
+    return total;
+"""
+_REMOVE = """
+    REAL* __restrict__ A = law.basis.data + a; const REAL* __restrict__ B = law.basis.data + b;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int i = lane; i < count; i += LANES) A[i] -= share * B[i];
+"""
+
+
 @functools.cache
-def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
+def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
-    NearField, Increment = near_field.struct(p), chain.types(p).Increment
+    ContactFlow, Increment = contact_flow.struct(p), chain.types(p).Increment
     vecd = wp.types.vector(DIRECTIONS, real)
     hessenberg = wp.types.matrix((DIRECTIONS + 1, DIRECTIONS), real)
     rotations = wp.types.vector(DIRECTIONS + 1, real)
     steric_force, steric_stiffness = steric.functions(p).steric_force, steric.functions(p).steric_stiffness
     gap_change = contacts.functions(p).gap_change
-    f = compliance.functions(p, pairs)
+    f = compliance.functions(p, pairs, form, lanes)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
     directions, iterations, halvings = wp.constant(DIRECTIONS), wp.constant(ITERATIONS), wp.constant(HALVINGS)
     patience = wp.constant(PATIENCE)
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
     cutoff, linear_below = wp.constant(real(steric.CUTOFF)), wp.constant(real(steric.LINEAR_BELOW))
-    settled = wp.constant(real(0.1 * FINEST))
+    settled = wp.constant(real(SETTLED))
     infinite = wp.constant(real(3.0e38))
     least_reduction, most_reduction = wp.constant(real(LEAST_REDUCTION)), wp.constant(real(MOST_REDUCTION))
-    module = p.module("contact_law", pairs)
+    module = p.module("contact_law", f"{pairs}_{form}_{lanes}")
+
+    def native(code: str) -> str:
+        return code.replace("REAL", {"float64": "double", "float32": "float"}[p.name]).replace("LANES", str(lanes))
+
+    @wp.func_native(native(_DOT))
+    def dot_basis(law: Law, a: wp.int32, b: wp.int32, count: wp.int32, lane: wp.int32) -> real: ...
+
+    @wp.func_native(native(_REMOVE))
+    def remove(law: Law, a: wp.int32, b: wp.int32, count: wp.int32, lane: wp.int32, share: real): ...
 
     @wp.kernel(module=module)
     def press(
@@ -61,7 +91,6 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         # State:
         state: State,
         contacts_in: Contacts,
-        lanes: wp.int32,
         # Out:
         law: Law,
     ):
@@ -71,8 +100,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         i = contacts_in.first[c] + lane
         while i < contacts_in.first[c] + contacts_in.count[c]:
             gap = wp.max(contacts_in.gap[i], deepest * model.steric_diameter[c])
-            law.pressed[i] = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
-            law.force[i] = law.pressed[i]
+            law.force[i] = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
             law.solved_gap[i] = contacts_in.gap[i]
             i += lanes
 
@@ -90,15 +118,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         return time * weights * model.mobility_across[e]
 
     @wp.func(module=module)
-    def settle(s: real, compliance: real, strength: real, diameter: real):
-        """The gap of a contact that yields alone: gap - compliance F(gap) = s."""
-        edge = cutoff * diameter
-        if s >= edge:
+    def settle(s: real, compliance: real, strength: real, diameter: real, gap: real):
+        """The gap of a contact that yields alone, gap - compliance F(gap) = s, from an estimate of it."""
+        if s >= cutoff * diameter:
             return s
-        # The left side is concave: from below, Newton's method rises to the solution without overshooting.
-        gap = wp.max(s, linear_below * diameter)
-        if gap - compliance * steric_force(gap, strength, diameter) > s:
-            gap = s  # the solution lies where the law is linear, and is found at once
+        # The left side is concave: Newton's method overshoots from above once, from below it rises to the solution.
+        gap = wp.clamp(gap, linear_below * diameter, cutoff * diameter)
         i = int(0)
         while i < 20:
             f = gap - compliance * steric_force(gap, strength, diameter) - s
@@ -115,11 +140,10 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         band: Band,
-        near: NearField,
+        flow: ContactFlow,
         law: Law,
         c: wp.int32,
         lane: wp.int32,
-        lanes: wp.int32,
     ):
         """Residuals at the solved gaps; the largest."""
         strength = model.steric_strength[c]
@@ -134,9 +158,9 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
             if load != real(0.0):
                 loaded = real(1.0)
             i += lanes
-        loaded = block_max(law, loaded, c, lane, lanes)
+        loaded = block_max(law, loaded, c, lane)
         if loaded > real(0.0):
-            product(model, state, contacts_in, band, near, law, c, lane, lanes)
+            product(model, state, contacts_in, band, flow, law, c, lane)
         worst = real(0.0)
         i = begin + lane
         while i < stop:
@@ -148,7 +172,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                 r = infinite  # a maximum would pass over what is not a number
             worst = wp.max(worst, wp.abs(r))
             i += lanes
-        return block_max(law, worst, c, lane, lanes), loaded
+        return block_max(law, worst, c, lane), loaded
 
     @wp.kernel(module=module)
     def solve(
@@ -158,10 +182,9 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         band: Band,
-        near: NearField,
+        flow: ContactFlow,
         start: Increment,
         coarse: real,
-        lanes: wp.int32,
         # Out:
         law: Law,
         x: Increment,
@@ -190,7 +213,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         halving = int(0)
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
-            worst, loaded = evaluate(model, state, contacts_in, band, near, law, c, lane, lanes)
+            worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, lane)
             if worst <= tolerance:
                 going = 0
             elif iteration > 0 and not (worst < before) and halving < halvings:
@@ -214,7 +237,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                     law.basis[own_basis + i - begin] = b
                     norm += b * b
                     i += lanes
-                norm = wp.sqrt(block_sum(law, norm, c, lane, lanes))
+                norm = wp.sqrt(block_sum(law, norm, c, lane))
                 enough = most_reduction
                 if iteration < patience:
                     enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
@@ -238,7 +261,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                         law.basis[at + i] = v
                         law.load[begin + i] = law.root[begin + i] * v
                         i += lanes
-                    product(model, state, contacts_in, band, near, law, c, lane, lanes)
+                    product(model, state, contacts_in, band, flow, law, c, lane)
                     i = lane
                     while i < stop - begin:
                         change = law.change[begin + i]
@@ -250,24 +273,12 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                     m = int(0)
                     while m <= n:
                         other = own_basis + m * capacity
-                        dot = real(0.0)
-                        i = lane
-                        while i < stop - begin:
-                            dot += law.basis[other + i] * law.basis[at + capacity + i]
-                            i += lanes
-                        dot = block_sum(law, dot, c, lane, lanes)
-                        i = lane
-                        while i < stop - begin:
-                            law.basis[at + capacity + i] = law.basis[at + capacity + i] - dot * law.basis[other + i]
-                            i += lanes
+                        dot = block_sum(law, dot_basis(law, other, at + capacity, stop - begin, lane), c, lane)
+                        remove(law, at + capacity, other, stop - begin, lane, dot)
                         h[m, n] = dot
                         m += 1
-                    size = real(0.0)
-                    i = lane
-                    while i < stop - begin:
-                        size += law.basis[at + capacity + i] * law.basis[at + capacity + i]
-                        i += lanes
-                    size = wp.sqrt(block_sum(law, size, c, lane, lanes))
+                    size = dot_basis(law, at + capacity, at + capacity, stop - begin, lane)
+                    size = wp.sqrt(block_sum(law, size, c, lane))
                     h[n + 1, n] = size
                     # Givens rotations turn the Hessenberg matrix into a triangle.
                     m = int(0)
@@ -308,7 +319,7 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
                     k = steric_stiffness(gap, strength, diameter)
                     alone = gap - compliance * steric_force(gap, strength, diameter)
                     alone += (real(1.0) + compliance * k) * change
-                    change = settle(alone, compliance, strength, diameter) - gap
+                    change = settle(alone, compliance, strength, diameter, gap + change) - gap
                     # Kept, should the step have to be shortened.
                     law.basis[own_basis + i] = change
                     law.solved_gap[begin + i] = gap + change
@@ -323,7 +334,6 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
         i = begin + lane
         while i < stop:
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
-            law.load[i] = law.force[i] - law.pressed[i]
             contacts_in.gap[i] = law.solved_gap[i]
             i += lanes
         e = model.first_node[model.first_flagellum[c]] + lane
@@ -344,10 +354,9 @@ def _kernels(p: Precision, pairs: str) -> SimpleNamespace:
 
 
 def press(model: DeviceModel, state: DeviceState, contacts_in: Any, law: Any) -> None:
-    """Forces at the listed gaps, into `force` and `pressed`: where the solution begins."""
-    kernel, lanes = _kernels(model.precision, model.switches.pairs).press, _lanes(model)
-    inputs = [model.data, state.data, contacts_in, lanes, law]
-    wp.launch(kernel, (model.cell_count, lanes), inputs=inputs, device=model.device)
+    """Forces at the listed gaps, into `force`: where the solution begins."""
+    inputs = [model.data, state.data, contacts_in, law]
+    wp.launch(_kernels_of(model).press, (model.cell_count, _lanes(model)), inputs=inputs, device=model.device)
 
 
 def solve(
@@ -355,7 +364,7 @@ def solve(
     state: DeviceState,
     contacts_in: Any,
     band: Any,
-    near: Any,
+    flow: Any,
     start: Any,
     law: Any,
     out: Any,
@@ -370,10 +379,15 @@ def solve(
         out: increment with their answer, `start` + Y (F - acting).
         coarse: how many times the tolerance is enough.
     """
-    kernel, lanes = _kernels(model.precision, model.switches.pairs).solve, _lanes(model)
-    inputs = [model.data, state.data, contacts_in, band, near, start, coarse, lanes, law, out]
+    lanes = _lanes(model)
+    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, law, out]
+    kernel = _kernels_of(model).solve
     wp.launch(kernel, (model.cell_count, lanes), inputs=inputs, device=model.device, block_dim=lanes)
 
 
 def _lanes(model: DeviceModel) -> int:
     return 1 if model.device.is_cpu else LANES
+
+
+def _kernels_of(model: DeviceModel) -> SimpleNamespace:
+    return _kernels(model.precision, model.switches.pairs, contact_flow.form_of(model), _lanes(model))

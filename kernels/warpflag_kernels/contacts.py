@@ -29,6 +29,7 @@ def struct(p: Precision) -> Any:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
+        found: wp.array(dtype=wp.uint64)  # [E], which neighbours of a segment are contacts, a bit each
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
         stop: wp.array(dtype=wp.int32)  # [E]
         head: wp.array(dtype=wp.int32)  # [E], first contact whose other side is this segment; -1: none
@@ -41,6 +42,7 @@ def struct(p: Precision) -> Any:
         gap: wp.array(dtype=real)  # [capacity], distance of the centre lines, or of the node from the surface [um]
         next: wp.array(dtype=wp.int32)  # [capacity], next with that other side, or of that flagellum with the body
         anchored: wp.array(dtype=wp.int32)  # [capacity], 1: the segment begins at r_0, 2: the other one does, 3: both
+        acting: wp.array(dtype=vec3)  # [E], contact forces on a node that act already [pN]
 
     return Contacts
 
@@ -130,7 +132,7 @@ def functions(p: Precision) -> SimpleNamespace:
             i = contacts_in.next[i]
         return load
 
-    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load)
+    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load, on_body=on_body)
 
 
 @functools.cache
@@ -138,9 +140,18 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
     Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
-    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
+    near_by = neighbours.functions(p)
+    candidates, candidate, beside = near_by.candidates, near_by.candidate, near_by.beside
+    all_slots = wp.constant(neighbours.SLOTS)
     reach_factor, segment_loads = real(steric.CUTOFF + MARGIN), functions(p).segment_loads
     module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
+
+    @wp.func(module=module)
+    def direction(apart: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
+        """Normal of two segments along d1, d2 that are apart by a vector of length r."""
+        if r > real(1.0e-3) * diameter:
+            return apart / r
+        return wp.normalize(wp.cross(d1, d2))  # centre lines that touch: part them across both
 
     @wp.func(module=module)
     def visit(model: Model, pose: Pose, near: Neighbours, contacts: Contacts, e: wp.int32, write: wp.int32):
@@ -156,16 +167,23 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             own_reach = real(0.5) * pose.length[e] + reach
             later = model.first_node[k + 1]
             n = candidates(model, near, e)
+            seen = wp.uint64(0)  # which candidates are contacts; those of a longer list are looked at twice
+            if write >= 0 and n <= all_slots:
+                seen = contacts.found[e]
+            bit = wp.uint64(1)
             entry = int(0)
             while entry < n:
                 j = candidate(model, near, e, entry)
-                entry += 1
-                if j >= later:
+                skipped = write >= 0 and n <= all_slots and (seen & bit) == wp.uint64(0)
+                if j >= later and not skipped:
                     p2 = pose.position[j - 1]
                     q2 = pose.position[j]
                     away = middle - real(0.5) * (p2 + q2)
-                    within = own_reach + real(0.5) * pose.length[j]
-                    if wp.dot(away, away) < within * within:
+                    half = real(0.5) * pose.length[j]
+                    within = own_reach + half
+                    if wp.dot(away, away) < within * within and not beside(
+                        away, pose.tangent[e], pose.tangent[j], half, reach
+                    ):
                         st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
                         apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
                         r = wp.length(apart)
@@ -180,11 +198,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
                                 first = model.first_node[model.flagellum_of[j]]
                                 contacts.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
-                                if r > real(1.0e-3) * model.steric_diameter[c]:
-                                    contacts.normal[i] = apart / r
-                                else:
-                                    contacts.normal[i] = wp.normalize(wp.cross(q1 - p1, q2 - p2))
+                                diameter = model.steric_diameter[c]
+                                contacts.normal[i] = direction(apart, r, q1 - p1, q2 - p2, diameter)
                             found += 1
+                            seen = seen | bit
+                entry += 1
+                bit = bit << wp.uint64(1)
+            if write < 0:
+                contacts.found[e] = seen
         if wp.static(body):
             axis = pose.body_axis[c]
             half = model.body_half_length[c]
@@ -320,24 +341,31 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             axis = pose.body_axis[c]
             half = model.body_half_length[c]
             y = pose.position[e]
-            distance = wp.length(y - wp.clamp(wp.dot(y, axis), -half, half) * axis)
+            away_from_axis = y - wp.clamp(wp.dot(y, axis), -half, half) * axis
+            distance = wp.length(away_from_axis)
             contacts.gap[i] = distance - model.body_radius[c]
+            contacts.normal[i] = away_from_axis / distance
         else:
             p1 = pose.position[e - 1]
             p2 = pose.position[j - 1]
             d1 = pose.position[e] - p1
             d2 = pose.position[j] - p2
             st = closest_parameters(p1, d1, p2, d2)
-            contacts.gap[i] = wp.length(p1 + st[0] * d1 - p2 - st[1] * d2)
+            contacts.at[i] = st[0]
+            contacts.at_other[i] = st[1]
+            apart = p1 + st[0] * d1 - p2 - st[1] * d2
+            r = wp.length(apart)
+            contacts.gap[i] = r
+            contacts.normal[i] = direction(apart, r, d1, d2, model.steric_diameter[c])
 
     @wp.kernel(module=module)
     def act(
         # Model:
         model: Model,
         # State:
-        contacts: Contacts,
         magnitude: wp.array(dtype=real),
         # Out:
+        contacts: Contacts,
         state: State,
     ):
         e = wp.tid()
@@ -347,6 +375,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         if e + 1 < model.first_node[model.flagellum_of[e] + 1]:
             on_first, _after = segment_loads(contacts, magnitude, e + 1)
             load += on_first
+        contacts.acting[e] = load
         state.force[e] = state.force[e] + load
         if wp.static(body):
             i = contacts.stop[e] - 1
@@ -375,7 +404,7 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> No
 
 
 def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, most: int) -> None:
-    """The gaps of the listed contacts at another pose.
+    """The gaps of the listed contacts at another pose, and where and along which directions they act there.
 
     Args:
         most: launch size, contacts per cell at most.
@@ -386,7 +415,7 @@ def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, mo
 
 
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
-    """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
+    """Adds forces of these magnitudes at the listed contacts [pN] to `force`; sets `acting` and `body_contact`."""
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
-    inputs = [model.data, contacts, magnitude, state.data]
+    inputs = [model.data, magnitude, contacts, state.data]
     wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

@@ -24,7 +24,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
     Contacts, Law = contacts.struct(p), compliance.struct(p)
-    segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
+    lever = contacts.functions(p)
+    segment_loads, body_load, on_body = lever.segment_loads, lever.body_load, lever.on_body
     variant = ("bearing" if bearing_torque else "") + ("touching" if touching else "")
     module = p.module("correction", variant)
 
@@ -94,10 +95,11 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         force = vec3(real(0.0))
         torque = -state.joint_spin_before[e]
         if wp.static(touching):
-            _before, force = segment_loads(contacts_in, law.load, e)
+            _before, force = segment_loads(contacts_in, law.force, e)
             if e + 1 < model.first_node[k + 1]:
-                on_first, _after = segment_loads(contacts_in, law.load, e + 1)
+                on_first, _after = segment_loads(contacts_in, law.force, e + 1)
                 force += on_first
+            force -= contacts_in.acting[e]
         if e + 1 < model.first_node[k + 1]:
             force += segment_change(model, state, stiffness, x, e + 1, k)
         else:
@@ -125,7 +127,12 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         force = state.force[first]
         torque = wp.cross(state.position[first], force)
         if wp.static(touching):
-            load = body_load(model, state, contacts_in, law.load, k, force)
+            load = body_load(model, state, contacts_in, law.force, k, force)
+            i = contacts_in.body_head[k]
+            while i >= 0:
+                e = contacts_in.segment[i]
+                load += on_body(state.body_contact[e], state.position[e])
+                i = contacts_in.next[i]
             force = vec3(load[0], load[1], load[2])
             torque = vec3(load[3], load[4], load[5])
         if wp.static(bearing_torque):
@@ -204,7 +211,7 @@ def correct(
     stiffness: Any,
     band: Any,
     contacts_in: Any,
-    near: Any,
+    flow: Any,
     law: Any,
     drive: Any,
     x: Any,
@@ -223,7 +230,7 @@ def correct(
     change = rho
     if touching:
         change = scratch
-        contact_law.solve(model, state, contacts_in, band, near, rho, law, change)
+        contact_law.solve(model, state, contacts_in, band, flow, rho, law, change)
     kernels = _kernels(model.precision, model.switches.bearing_torque, touching)
     wp.launch(kernels.add, model.element_count, inputs=[model.data, state.data, change, x], device=model.device)
 

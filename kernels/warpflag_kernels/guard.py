@@ -71,9 +71,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Chart, Guard = chart_stage.struct(p), struct(p)
     twist_angle = frames.functions(p).twist_angle
     closest_parameters = steric.functions(p).closest_parameters
-    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
+    near_by = neighbours.functions(p)
+    candidates, candidate, beside = near_by.candidates, near_by.candidate, near_by.beside
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
-    flow_reach, contact_reach = wp.constant(real(neighbours.REACH)), wp.constant(real(neighbours.CONTACT_REACH))
+    contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
@@ -211,9 +212,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             moved = wp.max(moved, guard.moved[other])
             shifted = wp.max(shifted, guard.shifted[other])
             other += 1
-        beyond = wp.max(flow_reach - real(0.5) * state.length[e], contact_reach * model.steric_diameter[c])
         later = model.first_node[k + 1]
-        listed = real(2.0) * (moved + shifted) + touch < beyond + skin
+        listed = real(2.0) * (moved + shifted) + touch < contact_reach * model.steric_diameter[c] + skin
         n = model.first_node[model.first_flagellum[c + 1]] - later
         if listed:
             n = candidates(model, near, e)
@@ -228,11 +228,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 p2n = state.position[j - 1]
                 q2n = state.position[j]
                 away = middle - real(0.5) * (p2n + q2n)
-                within = reach + real(0.5) * state.length[j]
-                if wp.dot(away, away) < within * within and crossed(
-                    p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch
+                half = real(0.5) * state.length[j]
+                within = reach + half
+                if wp.dot(away, away) < within * within and not beside(
+                    away, state.tangent[e], state.tangent[j], half, touch + real(2.0) * moved
                 ):
-                    wp.atomic_min(control.fault, c, crossing + e)
+                    if crossed(p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch):
+                        wp.atomic_min(control.fault, c, crossing + e)
 
     @wp.kernel(module=module)
     def measure_moves(

@@ -25,10 +25,10 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-# Largest error of a node over the mean of its flagellum. The mean is what is followed: contacts that open, close or
-# pass a vertex make single nodes jump, which does not add up.
-PEAK = 2.5
-GAP_SHARE = 0.05  # of the error that a step may make, for what the contact law leaves over
+# Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
+# vertex make single nodes jump, which does not add up.
+PEAK = 3.5
+GAP_SHARE = 0.3  # of the error that a step may make, for what the contact law leaves over
 
 
 @functools.cache
@@ -44,7 +44,7 @@ def struct(p: Precision) -> Any:
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
-        error: wp.array(dtype=real)  # [K], estimate of the node error of a flagellum [um]
+        error: wp.array(dtype=real)  # [K], estimated node errors of a flagellum, their sum [um]
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
@@ -64,7 +64,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     module = p.module("implicit")
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
-    peak = wp.constant(real(PEAK))
+    peak = wp.constant(wp.float64(PEAK))
     finest, gap_share = wp.constant(wp.float64(contact_law.FINEST)), wp.constant(wp.float64(GAP_SHARE))
 
     @wp.kernel(module=module)
@@ -207,10 +207,9 @@ def kernels(p: Precision) -> SimpleNamespace:
             e = first + 1
             while e < model.first_node[k + 1]:
                 d = x.node[e] - scale * (last.node[e] - real(ratio) * before.node[e])
-                total += d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+                total += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
                 e += 1
-        nodes = real(model.first_node[k + 1] - first - 1)
-        imp.error[k] = peak * wp.sqrt(total / nodes) / real(12.0)
+        imp.error[k] = total / real(12.0)
 
     @wp.kernel(module=module)
     def decide(
@@ -233,9 +232,12 @@ def kernels(p: Precision) -> SimpleNamespace:
         dt = control.step[c]
         error = wp.float64(0.0)
         k = model.first_flagellum[c]
+        nodes = int(0)
         while k < model.first_flagellum[c + 1]:
-            error = wp.max(error, wp.float64(imp.error[k]))
+            error += wp.float64(imp.error[k])
+            nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
+        error = peak * error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):

@@ -71,73 +71,14 @@ _ROW = """
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
-    Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
-    module = p.module("mobility", pairs + ("_halves" if halves else ""))
-    within, between = pairs in ("within", "all"), pairs in ("between", "all")
-
-    @wp.func(module=module)
-    def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
-        x = state.position[e]
-        force = state.force[e]
-        if e == model.first_node[model.flagellum_of[e]]:
-            force = vec3(real(0.0))
-        s.x[e] = x[0]
-        s.y[e] = x[1]
-        s.z[e] = x[2]
-        s.fx[e] = force[0]
-        s.fy[e] = force[1]
-        s.fz[e] = force[2]
-
-    @wp.kernel(module=module)
-    def pack(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        pack_node(model, state, s, wp.tid())
+def pair_rows(p: Precision) -> SimpleNamespace:
+    """Device functions of the pair sum's rows: `add_row` counts pairs at both nodes, `gather_pairs` at one."""
+    real, vec3, PairSum = p.real, p.vec3, structs(p).PairSum
 
     @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
 
-    @wp.kernel(module=module)
-    def add_rows(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
-        begin = model.first_node[model.first_flagellum[c]]
-        end = model.first_node[model.first_flagellum[c + 1]]
-        i = begin
-        while i < end:
-            pack_node(model, state, s, i)
-            s.ux[i] = real(0.0)
-            s.uy[i] = real(0.0)
-            s.uz[i] = real(0.0)
-            i += 1
-        i = begin
-        while i < end:
-            own = model.first_node[model.flagellum_of[i]]
-            if i > own:
-                if wp.static(within and between):
-                    add_row(s, i, begin, i, model.pair_radius[c])
-                elif wp.static(within):
-                    add_row(s, i, own, i, model.pair_radius[c])
-                else:
-                    add_row(s, i, begin, own, model.pair_radius[c])
-            i += 1
-
-    @wp.func(module=module)
+    @wp.func(module=p.module("mobility_functions"))
     def gather_pairs(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
         """Sum over nodes [begin, end) of 8 pi eta times the Rotne-Prager tensor times the force."""
         # Scalar loads, scalar accumulators and a while loop are what lets the compiler vectorise this.
@@ -177,6 +118,74 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             uz += ci * fz + df * dz
             j += 1
         return vec3(ux, uy, uz)
+
+    return SimpleNamespace(add_row=add_row, gather_pairs=gather_pairs)
+
+
+@functools.cache
+def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
+    module = p.module("mobility", pairs + ("_halves" if halves else ""))
+    within, between = pairs in ("within", "all"), pairs in ("between", "all")
+    add_row, gather_pairs = pair_rows(p).add_row, pair_rows(p).gather_pairs
+
+    @wp.func(module=module)
+    def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
+        x = state.position[e]
+        force = state.force[e]
+        if e == model.first_node[model.flagellum_of[e]]:
+            force = vec3(real(0.0))
+        s.x[e] = x[0]
+        s.y[e] = x[1]
+        s.z[e] = x[2]
+        s.fx[e] = force[0]
+        s.fy[e] = force[1]
+        s.fz[e] = force[2]
+
+    @wp.kernel(module=module)
+    def pack(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        pack_node(model, state, s, wp.tid())
+
+    @wp.kernel(module=module)
+    def add_rows(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        i = begin
+        while i < end:
+            pack_node(model, state, s, i)
+            s.ux[i] = real(0.0)
+            s.uy[i] = real(0.0)
+            s.uz[i] = real(0.0)
+            i += 1
+        i = begin
+        while i < end:
+            own = model.first_node[model.flagellum_of[i]]
+            if i > own:
+                if wp.static(within and between):
+                    add_row(s, i, begin, i, model.pair_radius[c])
+                elif wp.static(within):
+                    add_row(s, i, own, i, model.pair_radius[c])
+                else:
+                    add_row(s, i, begin, own, model.pair_radius[c])
+            i += 1
 
     @wp.kernel(module=module)
     def velocities(

@@ -1,6 +1,6 @@
 """Near segments of other flagella: a list per segment that holds until something has moved by half its skin.
 
-Contact, its search for a step, and the flows between near nodes all ask which segments are close. A list that is a
+Contact, its search for a step and the guard against crossings all ask which segments are close. A list that is a
 skin longer than the reach answers for many passes: it is built anew only when some node of the cell has moved by more
 than half the skin since. A segment in a crowd larger than its list asks all segments instead; either way the answer
 is the same, in the same order.
@@ -13,7 +13,6 @@ import warp as wp
 
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-REACH = 0.3  # of the flows between near nodes, between the midpoints of their segments [um]
 CONTACT_REACH = 1.35  # of contacts, the cutoff and what a step's search adds [sigma]
 SKIN = 0.1  # [um]
 SLOTS = 64  # segments that a list holds
@@ -21,8 +20,8 @@ SLOTS = 64  # segments that a list holds
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions: how many candidates a segment has, which they are, and how to skip along a chain."""
-    real = p.real
+    """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
+    real, vec3 = p.real, p.vec3
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
     slots = wp.constant(SLOTS)
     module = p.module("neighbours_functions")
@@ -66,7 +65,23 @@ def functions(p: Precision) -> SimpleNamespace:
             i += 1
         return i
 
-    return SimpleNamespace(candidates=candidates, candidate=candidate, middle=middle, next_near=next_near)
+    @wp.func(module=module)
+    def beside(away: vec3, t: vec3, u: vec3, half_length: real, distance: real):
+        """Whether a segment lies too far from the line of another to come within a distance of it.
+
+        Args:
+            away: from the midpoint of the other to its own [um].
+            t, u: tangents, of the other and its own; half_length: its own [um].
+        """
+        along = wp.dot(away, t)
+        c = wp.dot(t, u)
+        sine = wp.sqrt(wp.max(real(1.0) - c * c, real(0.0)))
+        clear = distance + half_length * sine
+        return wp.dot(away, away) - along * along > clear * clear
+
+    return SimpleNamespace(
+        candidates=candidates, candidate=candidate, middle=middle, next_near=next_near, beside=beside
+    )
 
 
 @functools.cache
@@ -74,7 +89,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     real = p.real
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
     middle, next_near = functions(p).middle, functions(p).next_near
-    slots, skin, flow_reach = wp.constant(SLOTS), wp.constant(real(SKIN)), wp.constant(real(REACH))
+    slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
     module = p.module("neighbours")
 
@@ -130,7 +145,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         found = int(0)
         if e > model.first_node[own]:
             x = middle(state, e)
-            beyond = wp.max(flow_reach, contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e])
+            beyond = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e]
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
                 j = model.first_node[k] + 1

@@ -191,6 +191,7 @@ class DeviceModel:
     Attributes:
         data: the struct `Model` of this precision.
         cell_count, flagellum_count, element_count: sizes C, K, E.
+        largest_cell: moving nodes of the largest cell.
     """
 
     precision: Precision
@@ -199,6 +200,7 @@ class DeviceModel:
     cell_count: int
     flagellum_count: int
     element_count: int
+    largest_cell: int
     data: Any
 
 

@@ -14,6 +14,7 @@ from warpflag_kernels import (
     chain,
     chart,
     compliance,
+    contact_flow,
     contact_law,
     contacts,
     control,
@@ -24,7 +25,6 @@ from warpflag_kernels import (
     hessian,
     implicit,
     mobility,
-    near_field,
     stability,
 )
 
@@ -45,8 +45,6 @@ ROUGH = 100.0
 """How many times their tolerance is enough for gaps that only lead to the pose in which they are measured again."""
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
-SWEEPS = 1
-"""Defect corrections per step for the flows that stay outside the matrix."""
 
 
 class ImplicitStepper:
@@ -92,7 +90,6 @@ class ImplicitStepper:
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
         self._free_step, self._step = increment(), increment()
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
-        self._sweeps = SWEEPS
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -109,12 +106,7 @@ class ImplicitStepper:
         self._band = b
 
         self._contacts, self._law = self._contact_arrays()
-        n = near_field.struct(p)()
-        n.count = zeros(elements, wp.int32)
-        slots = elements * near_field.SLOTS if self._touches and model.switches.pairs != "none" else 1
-        n.source, n.block = zeros(slots, wp.int32), zeros(slots, t.vec6)
-        self._near = n
-
+        self._flow = self._flow_arrays()
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
         i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
@@ -156,11 +148,10 @@ class ImplicitStepper:
         if self._touches:
             x = self._step
             self._touch(x)
-        for _ in range(self._sweeps):
-            correction.correct(
-                model, state, self._stiffness, band, self._contacts, self._near, self._law,
-                self._drive, x, self._defect, self._scratch,
-            )  # fmt: skip
+        correction.correct(
+            model, state, self._stiffness, band, self._contacts, self._flow, self._law,
+            self._drive, x, self._defect, self._scratch,
+        )  # fmt: skip
         inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
         wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
         inputs = [model.data, state.data, i, self._carried, x, self._total]
@@ -196,12 +187,11 @@ class ImplicitStepper:
         """The step with contacts, into x: those of the extrapolated pose, then their gaps in the pose they lead to."""
         model, state = self._system.model, self._system.state
         if model.switches.pairs != "none":
-            near_field.build(model, state, self._contacts, self._near)
+            contact_flow.build(model, state, self._contacts, self._flow)
         contact_law.solve(
-            model, state, self._contacts, self._band, self._near, self._free_step, self._law, x, coarse=ROUGH
+            model, state, self._contacts, self._band, self._flow, self._free_step, self._law, x, coarse=ROUGH
         )  # fmt: skip
-        carry = (self._carried, self._carried_before, self._next_last, self._next_before)
-        chain.retract(model, state, self._now, self.data.one, x, self._trial, carry)
+        chain.retract(model, state, self._now, self.data.one, x, self._trial)
         contacts.measure(model, state, self._trial, self._contacts, self._most_contacts)
 
     def _measure_stability(self) -> None:
@@ -259,6 +249,29 @@ class ImplicitStepper:
         s.probe = probe
         return s
 
+    def _flow_arrays(self) -> Any:
+        """The pair sum of contact forces; empty where they cause no flows."""
+        model = self._system.model
+        flow = contact_flow.struct(model.precision)()
+        if not self._touches or model.switches.pairs == "none":
+            return flow
+        for name, count in (("loaded", model.flagellum_count), ("start", model.flagellum_count)):
+            setattr(flow, name, wp.zeros(count, dtype=wp.int32, device=model.device))
+        for name in ("node", "place"):
+            setattr(flow, name, wp.zeros(model.element_count, dtype=wp.int32, device=model.device))
+        form, single = contact_flow.form_of(model), wp.float32
+        results = () if form == "gathered" else ("ux", "uy", "uz")
+        for name in ("x", "y", "z", "fx", "fy", "fz", *results):
+            setattr(flow.sum, name, wp.zeros(model.element_count, dtype=single, device=model.device))
+        if form == "kept":
+            ends = model.data.first_node.numpy()[model.data.first_flagellum.numpy()]
+            moving = np.diff(ends) - np.diff(model.data.first_flagellum.numpy())
+            pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
+            flow.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=model.device)
+            for name in ("c", "qx", "qy", "qz"):
+                setattr(flow, name, wp.zeros(int(pairs[-1]), dtype=single, device=model.device))
+        return flow
+
     def _contact_arrays(self) -> tuple[Any, Any]:
         """Contacts and their law: room for three per node of a cell (eight bundled flagella need two)."""
         model = self._system.model
@@ -276,13 +289,14 @@ class ImplicitStepper:
         c.first = wp.array(np.concatenate([[0], np.cumsum(capacity)]), dtype=wp.int32, device=device)
         c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
         c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
+        c.found = zeros(elements, wp.uint64)
         c.body_head = zeros(model.flagellum_count, wp.int32)
         c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
-        c.normal = zeros(total, p.vec3)
+        c.normal, c.acting = zeros(total, p.vec3), zeros(elements, p.vec3)
 
         law = compliance.struct(p)()
-        for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
+        for name in ("free_gap", "solved_gap", "residual", "force", "load", "change", "yielding", "root"):
             setattr(law, name, zeros(total, p.real))
         law.basis = zeros((contact_law.DIRECTIONS + 1) * total, p.real)
         law.moved = zeros(contact_law.DIRECTIONS * total, p.real)
