@@ -141,7 +141,9 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
     Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
     near_by = neighbours.functions(p)
-    candidates, candidate, beside = near_by.candidates, near_by.candidate, near_by.beside
+    candidates, candidate, first_later, beside = (
+        near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
+    )  # fmt: skip
     all_slots = wp.constant(neighbours.SLOTS)
     reach_factor, segment_loads = real(steric.CUTOFF + MARGIN), functions(p).segment_loads
     module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
@@ -165,17 +167,16 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             p1 = pose.position[e - 1]
             middle = real(0.5) * (p1 + q1)
             own_reach = real(0.5) * pose.length[e] + reach
-            later = model.first_node[k + 1]
             n = candidates(model, near, e)
             seen = wp.uint64(0)  # which candidates are contacts; those of a longer list are looked at twice
             if write >= 0 and n <= all_slots:
                 seen = contacts.found[e]
+            entry = first_later(model, near, e)
             bit = wp.uint64(1)
-            entry = int(0)
             while entry < n:
                 j = candidate(model, near, e, entry)
                 skipped = write >= 0 and n <= all_slots and (seen & bit) == wp.uint64(0)
-                if j >= later and not skipped:
+                if j >= 0 and not skipped:
                     p2 = pose.position[j - 1]
                     q2 = pose.position[j]
                     away = middle - real(0.5) * (p2 + q2)

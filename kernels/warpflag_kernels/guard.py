@@ -72,7 +72,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
     twist_angle = frames.functions(p).twist_angle
     closest_parameters = steric.functions(p).closest_parameters
     near_by = neighbours.functions(p)
-    candidates, candidate, beside = near_by.candidates, near_by.candidate, near_by.beside
+    candidates, candidate, first_later, beside = (
+        near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
+    )  # fmt: skip
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
@@ -215,16 +217,17 @@ def _kernels(p: Precision) -> SimpleNamespace:
         later = model.first_node[k + 1]
         listed = real(2.0) * (moved + shifted) + touch < contact_reach * model.steric_diameter[c] + skin
         n = model.first_node[model.first_flagellum[c + 1]] - later
+        i = int(0)
         if listed:
             n = candidates(model, near, e)
+            i = first_later(model, near, e)
         reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
-        i = int(0)
         while i < n:
             j = later + i
             if listed:
                 j = candidate(model, near, e, i)
             i += 1
-            if j >= later and j > model.first_node[model.flagellum_of[j]]:
+            if j > model.first_node[model.flagellum_of[j]]:
                 p2n = state.position[j - 1]
                 q2n = state.position[j]
                 away = middle - real(0.5) * (p2n + q2n)

@@ -47,6 +47,13 @@ def functions(p: Precision) -> SimpleNamespace:
         return j
 
     @wp.func(module=module)
+    def first_later(model: Model, near: Neighbours, e: wp.int32):
+        """From which candidate on they are of later flagella."""
+        if near.count[e] >= 0:
+            return near.earlier[e]
+        return model.first_node[model.flagellum_of[e] + 1] - model.first_node[model.first_flagellum[model.cell_of[e]]]
+
+    @wp.func(module=module)
     def middle(state: State, e: wp.int32):
         return real(0.5) * (state.position[e - 1] + state.position[e])
 
@@ -80,7 +87,7 @@ def functions(p: Precision) -> SimpleNamespace:
         return wp.dot(away, away) - along * along > clear * clear
 
     return SimpleNamespace(
-        candidates=candidates, candidate=candidate, middle=middle, next_near=next_near, beside=beside
+        candidates=candidates, candidate=candidate, first_later=first_later, middle=middle, next_near=next_near, beside=beside
     )
 
 
@@ -148,6 +155,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             beyond = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e]
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
+                if k == own:
+                    near.earlier[e] = found
                 j = model.first_node[k] + 1
                 end = model.first_node[k + 1]
                 while j < end and k != own:

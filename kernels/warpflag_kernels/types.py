@@ -162,6 +162,7 @@ def structs(p: Precision) -> SimpleNamespace:
         left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
         stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
+        earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
         segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
 
     return SimpleNamespace(Model=Model, State=State, PairSum=PairSum, Neighbours=Neighbours)
