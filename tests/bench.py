@@ -23,10 +23,10 @@ from warpflag.simulation import Simulation
 TOLERANCE = {"float64": 1e-8, "float32": 2e-3}
 
 
-def close(found: Any, exact: Any, precision: str, factor: float = 1.0) -> bool:
+def close(found: Any, exact: Any, precision: str, factor: float = 1.0, tolerance: Any = TOLERANCE) -> bool:
     """Within `factor` times the tolerance."""
     found, exact = np.asarray(found, dtype=np.float64), np.asarray(exact, dtype=np.float64)
-    return float(np.abs(found - exact).max()) <= factor * TOLERANCE[precision] * float(np.abs(exact).max())
+    return float(np.abs(found - exact).max()) <= factor * tolerance[precision] * float(np.abs(exact).max())
 
 
 class Bench:

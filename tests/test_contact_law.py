@@ -1,8 +1,7 @@
 """Contacts of an implicit step and the law they obey, against dense matrices in NumPy.
 
-B: unit forces at the contacts on (body, nodes); M~: local mobility and tapered Rotne-Prager blocks; P: the factorised
-system. Y = P g M~ B is what a load adds to the increment, W = B^T Y what it adds to the gaps. Layout as in
-`tests.bench`.
+B: unit forces at the contacts on (body, nodes); M: the mobility; P: the factorised system. Y = P g M B is what a load
+adds to the increment, W = B^T Y what it adds to the gaps. Layout as in `tests.bench`.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from warpflag_kernels import body, chain, contact_law, contacts, correction, implicit, near_field
+from warpflag_kernels import body, chain, contact_flow, contact_law, contacts, correction, implicit
 
 from tests.bench import TOLERANCE, Bench, close, dense_solver, displacements, flat, spins
 from tests.helpers import shaken, touching_cell
@@ -35,6 +34,10 @@ CELLS |= {
     "anchored": {"body.anchored": True},
 }
 CELLS |= {"no body contact": {"body.contact": False}, "strong": {"steric.strength": 80.0}}
+
+
+# Of what a load does: the flows it causes are found in single precision in either build.
+FLOW_TOLERANCE = {"float64": 2e-5, "float32": 2e-3}
 
 
 def touching(values: dict[str, Any], precision: str, device: str, seed: int = 1, separation: float = 0.042) -> Bench:
@@ -170,19 +173,6 @@ def dense_levers(b: Bench, contact_forces: list[np.ndarray] | None = None) -> np
     return np.stack(columns, axis=1)
 
 
-def near_mobility(b: Bench) -> np.ndarray:
-    """M~: between nodes the flow counts by (1 - d^2/reach^2)^2, d the distance of the midpoints of the segments that
-    end there, and in full from nodes that have a contact with the body."""
-    local, full = b.mobility("none"), b.mobility()
-    x = np.concatenate(b.start.positions)
-    middles = (x + np.roll(x, 1, axis=0)) / 2
-    apart = np.linalg.norm(middles[:, None] - middles, axis=2)
-    weights = np.maximum(1 - (apart / 0.3) ** 2, 0.0) ** 2
-    weights[:, [e for e, other in contact_list(b) if other < 0]] = 1.0
-    weights = np.pad(np.kron(weights, np.ones((4, 4))), (6, 0))
-    return local + weights * (full - local)
-
-
 def steric_force(gap: np.ndarray, strength: float) -> np.ndarray:
     """F_0 [2 (sigma/r)^13 - (sigma/r)^7] below the cutoff, along its tangent below 0.7 sigma [pN]."""
     x = np.asarray(gap, dtype=np.float64) / SIGMA
@@ -246,11 +236,12 @@ class Listed:
     def press(self) -> None:
         s = self.bench.stepper
         contact_law.press(self.bench.model, self.bench.state, s._contacts, s._law)
+        contacts.act(self.bench.model, self.bench.state, s._contacts, s._law.force)
 
     def solve(self, start: Any, coarse: float = 1.0) -> np.ndarray:
         """The increment with the answer of the contacts."""
         b, s, out = self.bench, self.bench.stepper, self.bench.increment()
-        contact_law.solve(b.model, b.state, s._contacts, s._band, s._near, start, s._law, out, coarse)
+        contact_law.solve(b.model, b.state, s._contacts, s._band, s._flow, start, s._law, out, coarse)
         return flat(out)
 
     def failed(self) -> bool:
@@ -268,11 +259,12 @@ def listed(b: Bench, step: float = STEP, tolerance: float = FINE) -> Listed:
     s._law.failed.zero_()
     find(b)
     contact_law.press(b.model, b.state, s._contacts, s._law)
+    contacts.act(b.model, b.state, s._contacts, s._law.force)
     levers, solver = dense_levers(b), dense_solver(b, step, 1.3 * GAIN)
     if b.model.switches.pairs != "none":
-        near_field.build(b.model, b.state, s._contacts, s._near)
+        contact_flow.build(b.model, b.state, s._contacts, s._flow)
     assert band.singular.numpy()[0] == 0
-    columns = solver @ (GAIN * near_mobility(b) @ levers)
+    columns = solver @ (GAIN * b.mobility() @ levers)
     return Listed(b, levers, solver, columns, levers.T @ columns, tolerance)
 
 
@@ -335,10 +327,10 @@ def check_answers(l: Listed, precision: str) -> None:
         l.set("force", -load)
         l.set("solved_gap", 1.0)
         x = l.solve(start, coarse=1e30)
-        assert close(l.own("change"), l.compliance @ load, precision)
+        assert close(l.own("change"), l.compliance @ load, precision, 1.0, FLOW_TOLERANCE)
         caused = l.columns @ load
         for part in (slice(0, 6), displacements(l.bench), spins(l.bench)):
-            assert close((x - flat(start))[part], caused[part], precision, 2.0) or not caused[part].any()
+            assert close((x - flat(start))[part], caused[part], precision, 2.0, FLOW_TOLERANCE) or not caused[part].any()
         assert np.abs(l.own("free_gap") - given - l.levers.T @ flat(start)).max() < 1e-7
     assert l.bench.stepper._law.products.numpy()[0] == 2
 
@@ -350,15 +342,14 @@ def obeyed(l: Listed, start: Any, acting: np.ndarray, given: np.ndarray, x: np.n
     """Checks a solution against the law and the dense matrices; returns the forces."""
     gaps, force = l.own("solved_gap"), l.own("force")
     assert not l.failed()
-    assert np.array_equal(l.own("gap"), gaps)
+    assert np.abs(l.own("gap") - gaps).max() < 1.1 * l.tolerance  # the gaps that the increment leads to
     assert close(force, steric_force(gaps, l.strength), precision)
-    assert close(l.own("load"), force - acting, precision)
     caused = l.columns @ (force - acting)
     # What the kernel calls solved, and what its round-off adds.
-    allowed = 1.1 * l.tolerance + TOLERANCE[precision] * np.abs(l.compliance @ (force - acting)).max()
+    allowed = 1.1 * l.tolerance + FLOW_TOLERANCE[precision] * np.abs(l.compliance @ (force - acting)).max()
     free = given + l.levers.T @ flat(start)
     assert np.abs(gaps - free - l.compliance @ (force - acting)).max() < allowed
-    assert close(x, flat(start) + caused, precision)
+    assert close(x, flat(start) + caused, precision, 1.0, FLOW_TOLERANCE)
     # To the tolerance the solution is the only one.
     exact = dense_solution(free, l.compliance, acting, l.strength)
     assert np.abs(gaps - exact).max() < 5 * allowed
@@ -373,10 +364,9 @@ def test_gaps_obey_the_law_at_the_end_of_the_step(name, device, precision):
     if name == "strong":  # the pose would mean hundreds of pN
         l.set("gap", np.linspace(1.05, 1.15, l.levers.shape[1]) * SIGMA)
         l.press()
-    acting, given, start = l.own("pressed"), l.own("gap"), l.push(2e-3)
+    acting, given, start = l.own("force"), l.own("gap"), l.push(2e-3)
     # Forces that act from the start are those at the gaps found; what overlaps deeply counts for less.
     assert close(acting, steric_force(np.maximum(given, contact_law.DEEPEST * SIGMA), l.strength), precision)
-    assert np.array_equal(l.own("force"), acting)
     force = obeyed(l, start, acting, given, l.solve(start), precision)
     assert (force > 0).sum() > 3 and force.max() > 2.0
     assert np.abs(force - acting).max() > 0.1 * force.max()
@@ -404,7 +394,7 @@ def test_newton_converges_from_far_away(name, step, start, device, precision):
     l = listed(touching(CELLS[name], precision, device, seed=0), step, CONTROLLED * step)
     l.set("gap", gap)
     l.press()
-    acting, given, push = l.own("pressed"), l.own("gap"), l.push(way)
+    acting, given, push = l.own("force"), l.own("gap"), l.push(way)
     obeyed(l, push, acting, given, l.solve(push), precision)
 
 
@@ -448,7 +438,7 @@ def driven(l: Listed, force: float) -> tuple[Any, Any]:
 
 def sweep(l: Listed, drive: Any, x: Any) -> None:
     b, s = l.bench, l.bench.stepper
-    parts = (s._stiffness, s._band, s._contacts, s._near, s._law)
+    parts = (s._stiffness, s._band, s._contacts, s._flow, s._law)
     correction.correct(b.model, b.state, *parts, drive, x, s._defect, s._scratch)
 
 
@@ -495,13 +485,17 @@ def test_sweeps_lead_to_the_solution_with_the_full_mobility(name, device, precis
     """(1/dt + g M H) x = drive + g M B (F(gap + B^T x) - acting), whatever the matrix and the law leave out of M."""
     l = listed(
         touching(CELLS[name], precision, device, seed=0, separation=0.055),
-        tolerance={"float64": 1e-12, "float32": 2e-7}[precision],
+        tolerance={"float64": 1e-8, "float32": 2e-7}[precision],
     )
-    b, acting, given = l.bench, l.own("pressed"), l.own("gap")
+    b, acting, given = l.bench, l.own("force"), l.own("gap")
     drive, free = driven(l, 2.0)
     found = l.solve(free)
     x = b.increment(found[:6], found[6:].reshape(-1, 4))
-    for _ in range(90):
+    for _ in range(20):
+        sweep(l, drive, x)
+    if precision == "float64":  # flows in single precision: only what is small can be found so finely
+        b.stepper._law.tolerance.fill_(1e-12)
+    for _ in range(70):
         sweep(l, drive, x)
     assert not l.failed()
     mobility = b.mobility()
@@ -513,3 +507,35 @@ def test_sweeps_lead_to_the_solution_with_the_full_mobility(name, device, precis
         assert close(flat(x)[part], solution[part], precision, 10.0)
     assert np.abs(l.own("gap") - gaps).max() < 10 * TOLERANCE[precision] * SIGMA
     assert np.abs(flat(x) - found).max() > 1e-3 * np.abs(found).max()
+
+
+@pytest.mark.parametrize("name", ["all", "bundle", "anchored", "no body contact"])
+def test_forces_act_where_and_along_what_the_pose_says_in_which_gaps_were_measured(name, device, precision):
+    """(1/dt + g M H) x = drive + g M [B' F(gap' + B'^T (x - x')) - B acting], with B', gap' of the pose of x'."""
+    l = listed(
+        touching(CELLS[name], precision, device, seed=0, separation=0.055),
+        tolerance={"float64": 1e-8, "float32": 2e-7}[precision],
+    )
+    b, s, acting = l.bench, l.bench.stepper, l.own("force")
+    drive, free = driven(l, 2.0)
+    found = l.solve(free)
+    x = b.increment(found[:6], found[6:].reshape(-1, 4))
+    given = pose_gaps(l, x)
+    contacts.measure(b.model, b.state, s._trial, s._contacts, s._most_contacts)
+    turned = dense_levers(b)
+    assert np.abs(turned - l.levers).max() > 0.05 and np.abs(l.own("gap") - given).max() < 1e-6
+    for _ in range(90):
+        sweep(l, drive, x)
+    assert not l.failed()
+    mobility = b.mobility()
+    system = np.eye(len(mobility)) / STEP + GAIN * mobility @ b.hessian()
+    free_of = np.linalg.solve(system, flat(drive) - GAIN * mobility @ l.levers @ acting)
+    columns = np.linalg.solve(system, GAIN * mobility @ turned)
+    at_rest = given + turned.T @ (free_of - found)
+    gaps = dense_solution(at_rest, turned.T @ columns, np.zeros(len(acting)), l.strength)
+    solution = free_of + columns @ steric_force(gaps, l.strength)
+    allowed = {"float64": 1e-5, "float32": 5e-3}[precision] * np.abs(solution).max()
+    assert np.abs(flat(x) - solution).max() < allowed
+    # With the forces along their old directions it would be another.
+    stale = free_of + np.linalg.solve(system, GAIN * mobility @ l.levers @ steric_force(gaps, l.strength))
+    assert np.abs(stale - solution).max() > 10 * allowed

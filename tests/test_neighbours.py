@@ -73,14 +73,12 @@ class Cells:
         return [segment[e, : count[e]].tolist() for e in range(len(count))]
 
     def neighbourly(self, x: np.ndarray) -> list[set[int]]:
-        """Segments of other flagella of the cell that contact, its search, or a flow can ask for, by segment."""
+        """Segments of other flagella of the cell that contact or its search can ask for, by segment."""
         found: list[set[int]] = [set() for _ in x]
         for c in range(self.model.cell_count):
             own = self.segments[self.cell[self.segments] == c]
             p, d = x[own - 1], x[own] - x[own - 1]
-            apart = np.linalg.norm((p + d / 2)[:, None] - (p + d / 2), axis=2)
-            reach = (CUTOFF + 0.15) * SIGMA
-            near = (segment_distances(p, d, p, d) < reach) | (apart < neighbours.REACH)
+            near = segment_distances(p, d, p, d) < (CUTOFF + 0.15) * SIGMA
             near &= self.flagellum[own][:, None] != self.flagellum[own]
             for i, j in np.argwhere(near):
                 found[own[i]].add(int(own[j]))
@@ -191,7 +189,7 @@ def test_lists_made_of_what_is_not_a_number_do_not_last(broken, device, precisio
 
 def test_a_crowd_too_large_for_a_list_asks_everyone(device, precision):
     """Eight fine filaments side by side: more near segments than a list holds, though not at their ends."""
-    values: dict[str, Any] = {"flagella.count": 8, "flagella.segment_length": 0.05, "flagella.length": 1.5}
+    values: dict[str, Any] = {"flagella.count": 8, "flagella.segment_length": 0.025, "flagella.length": 1.5}
     values |= {f"flagellum.{k}.azimuth": 5.0 * k for k in range(8)}
     values |= {"flagella.opening_angle": 0.0, "flagellum.7.azimuth": 80.0}
     sim = Simulation(cell(values, precision), device=device)

@@ -334,7 +334,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         i = begin + lane
         while i < stop:
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
-            contacts_in.gap[i] = law.solved_gap[i]
+            contacts_in.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
             i += lanes
         e = model.first_node[model.first_flagellum[c]] + lane
         end = model.first_node[model.first_flagellum[c + 1]]
