@@ -253,10 +253,14 @@ def seen(sim: Simulation, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """What the guard says of these motions, one per cell."""
     s = sim.system
     lengths = np.ones((COUNT, 2, 3))
-    lengths[:, :, 1:] = np.linalg.norm(np.diff(after, axis=2), axis=-1)
+    segments = np.diff(after, axis=2)
+    lengths[:, :, 1:] = np.linalg.norm(segments, axis=-1)
+    tangents = np.tile([0.0, 0.0, 1.0], (COUNT, 2, 3, 1))
+    tangents[:, :, 1:] = segments / lengths[:, :, 1:, None]
     s.guard.position.assign(before.reshape(-1, 3))
     s.state.data.position.assign(after.reshape(-1, 3))
     s.state.data.length.assign(lengths.ravel())
+    s.state.data.tangent.assign(tangents.reshape(-1, 3))
     s.state.data.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
     s.state.data.active.fill_(1)
     for flags in (s.chart.commit, s.chart.rest):

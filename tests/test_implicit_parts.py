@@ -259,7 +259,7 @@ def test_corrections_lead_to_the_solution_with_the_full_mobility(mode, device, p
     drive = b.increment(velocities[:6], velocities[6:].reshape(-1, 4))
     x, s = b.increment(), b.stepper
     s._law.gain.fill_(gain)
-    inputs = (b.model, b.state, s._stiffness, band, s._contacts, s._near, s._law, drive, x, s._defect, s._scratch)
+    inputs = (b.model, b.state, s._stiffness, band, s._contacts, s._flow, s._law, drive, x, s._defect, s._scratch)
     for _ in range(25):
         correction.correct(*inputs)
     for part in (slice(0, 6), displacements(b), spins(b)):
