@@ -330,7 +330,9 @@ def check_answers(l: Listed, precision: str) -> None:
         assert close(l.own("change"), l.compliance @ load, precision, 1.0, FLOW_TOLERANCE)
         caused = l.columns @ load
         for part in (slice(0, 6), displacements(l.bench), spins(l.bench)):
-            assert close((x - flat(start))[part], caused[part], precision, 2.0, FLOW_TOLERANCE) or not caused[part].any()
+            assert (
+                close((x - flat(start))[part], caused[part], precision, 2.0, FLOW_TOLERANCE) or not caused[part].any()
+            )
         assert np.abs(l.own("free_gap") - given - l.levers.T @ flat(start)).max() < 1e-7
     assert l.bench.stepper._law.products.numpy()[0] == 2
 

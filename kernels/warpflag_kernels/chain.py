@@ -164,7 +164,13 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
 
 
 def retract(
-    model: DeviceModel, state: Any, start: Any, scale: Any, x: Any, end: Any, carry: tuple[Any, Any, Any, Any] | None = None
+    model: DeviceModel,
+    state: Any,
+    start: Any,
+    scale: Any,
+    x: Any,
+    end: Any,
+    carry: tuple[Any, Any, Any, Any] | None = None,
 ) -> None:
     """The pose `end` reached from `start` by the increment scale * x, and two increments carried along.
 

@@ -133,9 +133,8 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
             if e + 1 < end:
                 f += law.on_first[e + 1]  # zero where the next element is a tripod
             law.on_node[e] = f
-            if wp.static(pairs != "none"):
-                if e > model.first_node[model.flagellum_of[e]]:
-                    load(flow, flow.place[e], f)
+            if wp.static(pairs != "none") and e > model.first_node[model.flagellum_of[e]]:
+                load(flow, flow.place[e], f)
             e += lanes
         meet()
         if wp.static(form != "gathered"):

@@ -19,7 +19,6 @@ import warp as wp
 from warpflag_kernels import contacts, mobility
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-
 KEPT = 512  # moving nodes of a cell up to which the coefficients of its pairs are kept
 
 # A row of the sum by halves over kept coefficients, the flow c f + q (q . f): pairs (i, j) for j in [begin, end).
@@ -202,7 +201,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def may_be_loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
-        """Whether node e of a flagellum that ends before `end` belongs to a segment with contacts, or has one itself."""
+        """Whether node e of a flagellum that ends before `end` has contacts, itself or through its segments."""
         if contacts_in.stop[e] > contacts_in.start[e] or contacts_in.head[e] >= 0:
             return True
         return e + 1 < end and (contacts_in.stop[e + 1] > contacts_in.start[e + 1] or contacts_in.head[e + 1] >= 0)

@@ -233,11 +233,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 away = middle - real(0.5) * (p2n + q2n)
                 half = real(0.5) * state.length[j]
                 within = reach + half
-                if wp.dot(away, away) < within * within and not beside(
-                    away, state.tangent[e], state.tangent[j], half, touch + real(2.0) * moved
+                if (
+                    wp.dot(away, away) < within * within
+                    and not beside(away, state.tangent[e], state.tangent[j], half, touch + real(2.0) * moved)
+                    and crossed(p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch)
                 ):
-                    if crossed(p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch):
-                        wp.atomic_min(control.fault, c, crossing + e)
+                    wp.atomic_min(control.fault, c, crossing + e)
 
     @wp.kernel(module=module)
     def measure_moves(

@@ -87,7 +87,12 @@ def functions(p: Precision) -> SimpleNamespace:
         return wp.dot(away, away) - along * along > clear * clear
 
     return SimpleNamespace(
-        candidates=candidates, candidate=candidate, first_later=first_later, middle=middle, next_near=next_near, beside=beside
+        candidates=candidates,
+        candidate=candidate,
+        first_later=first_later,
+        middle=middle,
+        next_near=next_near,
+        beside=beside,
     )
 
 
