@@ -66,7 +66,7 @@ def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypat
 
 def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
     implicit = {"numerics.stepper": "implicit"}
-    solver = {"contacts", "contact_law", "contact_flow"}
+    solver = {"contacts", "contact_law"}
     assert stages_of(launches(cell(implicit), monkeypatch)) & solver == solver
     off = {"steric.enabled": False, "body.contact": False, **implicit}
     assert not stages_of(launches(cell(off), monkeypatch)) & solver

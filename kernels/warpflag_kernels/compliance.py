@@ -14,7 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, contact_flow, contacts
+from warpflag_kernels import banded, chain, contacts
+from warpflag_kernels import flow as flow_stage
 from warpflag_kernels.types import Precision, structs
 
 LANES = 128  # threads of a block on CUDA
@@ -67,9 +68,9 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
-    ContactFlow, vec6 = contact_flow.struct(p), chain.types(p).vec6
-    flows = contact_flow.functions(p, pairs, form)
-    load, spread, flow_at = flows.load, flows.spread, flows.flow_at
+    Flow, vec6 = flow_stage.struct(p), chain.types(p).vec6
+    flows = flow_stage.functions(p, pairs, form)
+    load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
     body_mobility, solve_flagellum = banded.functions(p).body_mobility, banded.functions(p).solve_flagellum
     lever = contacts.functions(p)
     gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
@@ -109,7 +110,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         state: State,
         contacts_in: Contacts,
         band: Band,
-        flow: ContactFlow,
+        flow: Flow,
         law: Law,
         c: wp.int32,
         lane: wp.int32,
@@ -138,7 +139,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
             e += lanes
         meet()
         if wp.static(form != "gathered"):
-            spread(model, flow, c)
+            spread(model, flow, c, loaded_end(model, flow, c))
         gain = real(law.gain[c])
         e = begin + lane
         while e < end:
@@ -150,7 +151,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
                     t = state.tangent[e]
                     if e + 1 < model.first_node[k + 1]:
                         t = wp.normalize(t + state.tangent[e + 1])
-                    v = flow_at(model, flow, e, k, c)
+                    v = flow_at(model, flow, e, k, c, loaded_end(model, flow, c))
                     along = wp.dot(t, v) * t
                     f += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
                 f = gain * f

@@ -18,7 +18,8 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, compliance, contact_flow, contacts, steric
+from warpflag_kernels import banded, chain, compliance, contacts, steric
+from warpflag_kernels import flow as flow_stage
 from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
@@ -58,7 +59,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
-    ContactFlow, Increment = contact_flow.struct(p), chain.types(p).Increment
+    Flow, Increment = flow_stage.struct(p), chain.types(p).Increment
     vecd = wp.types.vector(DIRECTIONS, real)
     hessenberg = wp.types.matrix((DIRECTIONS + 1, DIRECTIONS), real)
     rotations = wp.types.vector(DIRECTIONS + 1, real)
@@ -140,7 +141,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         state: State,
         contacts_in: Contacts,
         band: Band,
-        flow: ContactFlow,
+        flow: Flow,
         law: Law,
         c: wp.int32,
         lane: wp.int32,
@@ -182,7 +183,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         state: State,
         contacts_in: Contacts,
         band: Band,
-        flow: ContactFlow,
+        flow: Flow,
         start: Increment,
         coarse: real,
         # Out:
@@ -390,4 +391,4 @@ def _lanes(model: DeviceModel) -> int:
 
 
 def _kernels_of(model: DeviceModel) -> SimpleNamespace:
-    return _kernels(model.precision, model.switches.pairs, contact_flow.form_of(model), _lanes(model))
+    return _kernels(model.precision, model.switches.pairs, flow_stage.form_of(model), _lanes(model))

@@ -14,19 +14,22 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, body, chain, compliance, contact_law, contacts, hessian, mobility
+from warpflag_kernels import banded, body, chain, compliance, contact_law, contacts, hessian
+from warpflag_kernels import flow as flow_stage
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamespace:
+def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, form: str) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
     Contacts, Law = contacts.struct(p), compliance.struct(p)
     lever = contacts.functions(p)
     segment_loads, body_load, on_body = lever.segment_loads, lever.body_load, lever.on_body
-    variant = ("bearing" if bearing_torque else "") + ("touching" if touching else "")
+    Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form)
+    load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
+    variant = "_".join([*["bearing"] * bearing_torque, *["touching"] * touching, pairs, form])
     module = p.module("correction", variant)
 
     @wp.func(module=module)
@@ -141,11 +144,38 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         state.flagellum_torque[k] = torque
 
     @wp.kernel(module=module)
+    def load_nodes(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        flow: Flow,
+    ):
+        e = wp.tid()
+        if e > model.first_node[model.flagellum_of[e]] and state.active[model.cell_of[e]] != 0:
+            load(flow, flow.place[e], state.force[e])
+
+    @wp.kernel(module=module)
+    def add_flows(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        flow: Flow,
+    ):
+        c = wp.tid()
+        if state.active[c] != 0:
+            spread(model, flow, c, places_end(model, c))
+
+    @wp.kernel(module=module)
     def residual(
         # Model:
         model: Model,
         # State:
         state: State,
+        flow: Flow,
         band: Band,
         law: Law,
         drive: Increment,
@@ -165,12 +195,15 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         spin = d[3] + gain * model.spin_mobility[k] * state.spin_torque[e] - inv_dt * y[3]
         v = vec3(real(0.0))
         if e > model.first_node[k]:
-            v = vec3(d[0], d[1], d[2]) + gain * state.velocity[e] - inv_dt * vec3(y[0], y[1], y[2])
+            v = vec3(d[0], d[1], d[2]) - inv_dt * vec3(y[0], y[1], y[2])
+            if wp.static(pairs != "none"):
+                v += gain * flow_at(model, flow, e, k, c, places_end(model, c))
             t = state.tangent[e]
             if e + 1 < model.first_node[k + 1]:
                 t = wp.normalize(t + state.tangent[e + 1])
             along = wp.dot(t, v) * t
             v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+            v += gain * state.force[e]
         elif k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]
@@ -200,6 +233,8 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool) -> SimpleNamesp
         joint_changes=joint_changes,
         gather_changes=gather_changes,
         sum_flagellum=sum_flagellum,
+        load_nodes=load_nodes,
+        add_flows=add_flows,
         residual=residual,
         add=add,
     )
@@ -225,13 +260,13 @@ def correct(
         rho, scratch: increments to work in; the forces of `state` are overwritten.
     """
     touching = model.switches.steric or model.switches.body_contact
-    defect(model, state, stiffness, band, law, drive, x, rho, contacts_in if touching else None)
+    defect(model, state, stiffness, band, flow, law, drive, x, rho, contacts_in if touching else None)
     banded.solve(model, state, band, rho)
     change = rho
     if touching:
         change = scratch
         contact_law.solve(model, state, contacts_in, band, flow, rho, law, change)
-    kernels = _kernels(model.precision, model.switches.bearing_torque, touching)
+    kernels = _kernels_of(model, touching)
     wp.launch(kernels.add, model.element_count, inputs=[model.data, state.data, change, x], device=model.device)
 
 
@@ -240,6 +275,7 @@ def defect(
     state: DeviceState,
     stiffness: Any,
     band: Any,
+    flow: Any,
     law: Any,
     drive: Any,
     x: Any,
@@ -248,7 +284,7 @@ def defect(
 ) -> None:
     """D^-1 times the residual of the full equations at x, into rho; without contact forces where there is no list."""
     touching = contacts_in is not None
-    kernels, device = _kernels(model.precision, model.switches.bearing_torque, touching), model.device
+    kernels, device = _kernels_of(model, touching), model.device
     listed = contacts_in if touching else contacts.struct(model.precision)()
     wp.launch(kernels.joint_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
     inputs = [model.data, stiffness, listed, law, x, state.data]
@@ -256,6 +292,15 @@ def defect(
     inputs = [model.data, listed, law, state.data]
     wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=device)
     body.move_bodies(model, state)
-    mobility.node_velocities(model, state)
-    inputs = [model.data, state.data, band, law, drive, x, rho]
+    if model.switches.pairs != "none":
+        inputs = [model.data, state.data, flow]
+        wp.launch(kernels.load_nodes, model.element_count, inputs=inputs, device=device)
+        if flow_stage.form_of(model) != "gathered":
+            wp.launch(kernels.add_flows, model.cell_count, inputs=inputs, device=device)
+    inputs = [model.data, state.data, flow, band, law, drive, x, rho]
     wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)
+
+
+def _kernels_of(model: DeviceModel, touching: bool) -> SimpleNamespace:
+    switches = model.switches
+    return _kernels(model.precision, switches.bearing_torque, touching, switches.pairs, flow_stage.form_of(model))

@@ -156,6 +156,7 @@ def measure(
     state: DeviceState,
     stiffness: Any,
     band: Any,
+    flow: Any,
     law: Any,
     nothing: Any,
     answer: Any,
@@ -172,7 +173,7 @@ def measure(
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     # The defect of the probe alone is the product with its sign changed, which a power iteration does not mind.
-    correction.defect(model, state, stiffness, band, law, nothing, stability.probe, answer)
+    correction.defect(model, state, stiffness, band, flow, law, nothing, stability.probe, answer)
     banded.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)

@@ -14,12 +14,12 @@ from warpflag_kernels import (
     chain,
     chart,
     compliance,
-    contact_flow,
     contact_law,
     contacts,
     control,
     correction,
     elastic,
+    flow,
     forces,
     guard,
     hessian,
@@ -137,6 +137,8 @@ class ImplicitStepper:
         if self._touches:
             contacts.find(model, state, self._now, self._contacts)
             contact_law.press(model, state, self._contacts, self._law)
+        if model.switches.pairs != "none":
+            flow.build(model, state, self._flow, self._contacts if self._touches else None)
         self._right_hand_side()
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
@@ -186,8 +188,6 @@ class ImplicitStepper:
     def _touch(self, x: Any) -> None:
         """The step with contacts, into x: those of the extrapolated pose, then their gaps in the pose they lead to."""
         model, state = self._system.model, self._system.state
-        if model.switches.pairs != "none":
-            contact_flow.build(model, state, self._contacts, self._flow)
         contact_law.solve(
             model, state, self._contacts, self._band, self._flow, self._free_step, self._law, x, coarse=ROUGH
         )  # fmt: skip
@@ -197,8 +197,8 @@ class ImplicitStepper:
     def _measure_stability(self) -> None:
         model, state = self._system.model, self._system.state
         stability.measure(
-            model, state, self._stiffness, self._band, self._law, self._nothing, self._defect, self.stability,
-            self.data.over_implicit,
+            model, state, self._stiffness, self._band, self._flow, self._law, self._nothing, self._defect,
+            self.stability, self.data.over_implicit,
         )  # fmt: skip
 
     def restart(self) -> None:
@@ -250,27 +250,28 @@ class ImplicitStepper:
         return s
 
     def _flow_arrays(self) -> Any:
-        """The pair sum of contact forces; empty where they cause no flows."""
+        """The pair sum of force changes; empty where forces cause no flows."""
         model = self._system.model
-        flow = contact_flow.struct(model.precision)()
-        if not self._touches or model.switches.pairs == "none":
-            return flow
-        for name, count in (("loaded", model.flagellum_count), ("start", model.flagellum_count)):
-            setattr(flow, name, wp.zeros(count, dtype=wp.int32, device=model.device))
-        for name in ("node", "place"):
-            setattr(flow, name, wp.zeros(model.element_count, dtype=wp.int32, device=model.device))
-        form, single = contact_flow.form_of(model), wp.float32
+        device, elements = model.device, model.element_count
+        sums = flow.struct(model.precision)()
+        if model.switches.pairs == "none":
+            return sums
+        sums.loaded, sums.start, sums.rest = (
+            wp.zeros(model.flagellum_count, dtype=wp.int32, device=device) for _ in range(3)
+        )
+        sums.node, sums.place = (wp.zeros(elements, dtype=wp.int32, device=device) for _ in range(2))
+        form = flow.form_of(model)
         results = () if form == "gathered" else ("ux", "uy", "uz")
         for name in ("x", "y", "z", "fx", "fy", "fz", *results):
-            setattr(flow.sum, name, wp.zeros(model.element_count, dtype=single, device=model.device))
+            setattr(sums.sum, name, wp.zeros(elements, dtype=wp.float32, device=device))
         if form == "kept":
-            ends = model.data.first_node.numpy()[model.data.first_flagellum.numpy()]
-            moving = np.diff(ends) - np.diff(model.data.first_flagellum.numpy())
+            first_flagellum = model.data.first_flagellum.numpy()
+            moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
             pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
-            flow.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=model.device)
+            sums.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=device)
             for name in ("c", "qx", "qy", "qz"):
-                setattr(flow, name, wp.zeros(int(pairs[-1]), dtype=single, device=model.device))
-        return flow
+                setattr(sums, name, wp.zeros(int(pairs[-1]), dtype=wp.float32, device=device))
+        return sums
 
     def _contact_arrays(self) -> tuple[Any, Any]:
         """Contacts and their law: room for three per node of a cell (eight bundled flagella need two)."""

@@ -1,13 +1,12 @@
-"""Flows that contact forces cause: the part of the pair sum that decides how contacts answer to each other.
+"""Flows that changes of forces cause within an implicit step: the pair sum, many times over at the same positions.
 
-Two filaments that push each other apart drag the fluid between them along, which makes the gap several times harder
-to open than local drag alone would; a node that is pressed against the body is felt everywhere. So the whole pair sum
-acts in a step's contact law, from the nodes that have contacts to all others. It stands for the change of forces
-within a step, many times over, hence in single precision in either build.
+Contact forces need it, since two filaments that push each other apart drag the fluid between them along, which makes
+the gap several times harder to open than local drag alone would, and so does the defect correction, for the elastic
+forces. Both are about changes within a step, so single precision is enough in either build.
 
-The places of a cell hold its moving nodes, loaded ones first, both flagellum after flagellum. A CPU keeps the
-coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading them would
-take as long as finding them again.
+The places of a cell hold its moving nodes, those that contacts can load first, both flagellum after flagellum. A CPU
+keeps the coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading
+them would take as long as finding them again.
 """
 
 import functools
@@ -65,13 +64,14 @@ _KEEP = """
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `ContactFlow`: which node is where in the sum."""
+    """The struct `Flow`: which node is where in the sum, and the coefficients of its pairs."""
     PairSum, single = structs(_single(p)).PairSum, _single(p).real
 
     @wp.struct
-    class ContactFlow:
+    class Flow:
         loaded: wp.array(dtype=wp.int32)  # [K], nodes that may be loaded by a contact
         start: wp.array(dtype=wp.int32)  # [K], places of these nodes lie in [start, start + loaded)
+        rest: wp.array(dtype=wp.int32)  # [K], where those of the flagellum's other nodes begin
         node: wp.array(dtype=wp.int32)  # [E], of a place; a cell's places begin where its elements do
         place: wp.array(dtype=wp.int32)  # [E], of a node
         sum: PairSum  # by place
@@ -82,16 +82,16 @@ def struct(p: Precision) -> Any:
         qy: wp.array(dtype=single)
         qz: wp.array(dtype=single)
 
-    return ContactFlow
+    return Flow
 
 
 @functools.cache
 def rows(p: Precision) -> Any:
     """Device function: the index from which the pairs (i, j) of a row are counted by j."""
-    ContactFlow = struct(p)
+    Flow = struct(p)
 
-    @wp.func(module=p.module("contact_flow_rows"))
-    def row_of(flow: ContactFlow, first: wp.int32, c: wp.int32, i: wp.int32):
+    @wp.func(module=p.module("flow_rows"))
+    def row_of(flow: Flow, first: wp.int32, c: wp.int32, i: wp.int32):
         n = i - first
         return flow.first_pair[c] + n * (n - 1) / 2 - first
 
@@ -100,20 +100,20 @@ def rows(p: Precision) -> Any:
 
 @functools.cache
 def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
-    """Device functions for one block of threads, in this order, its lanes meeting in between: `load`, `spread`, then
-    `flow_at` any node; for one form of the sum, see `form_of`."""
+    """Device functions for one block of threads, in this order, its lanes meeting in between: `load` every node,
+    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`."""
     real, vec3, single = p.real, p.vec3, _single(p)
-    Model, ContactFlow = structs(p).Model, struct(p)
+    Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
     add_row, gather_pairs = mobility.pair_rows(single).add_row, mobility.pair_rows(single).gather_pairs
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
     zero = wp.constant(single.real(0.0))
     halves, kept = form != "gathered", form == "kept"
-    module = p.module("contact_flow_functions", f"{pairs}_{form}")
+    module = p.module("flow_functions", f"{pairs}_{form}")
 
     @wp.func(module=module)
-    def load(flow: ContactFlow, place: wp.int32, f: vec3):
-        """Puts the contact force on the node of a place [pN]."""
+    def load(flow: Flow, place: wp.int32, f: vec3):
+        """Puts a force on the node of a place [pN]."""
         flow.sum.fx[place] = single.real(f[0])
         flow.sum.fy[place] = single.real(f[1])
         flow.sum.fz[place] = single.real(f[2])
@@ -123,47 +123,54 @@ def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
             flow.sum.uz[place] = zero
 
     @wp.func(module=module)
-    def sources(model: Model, flow: ContactFlow, c: wp.int32):
-        """Places of a cell's loaded nodes."""
-        first = model.first_flagellum[c]
+    def places_end(model: Model, c: wp.int32):
+        """Where the places of a cell end."""
+        return model.first_node[model.first_flagellum[c + 1]] - model.first_flagellum[c + 1] + model.first_flagellum[c]
+
+    @wp.func(module=module)
+    def loaded_end(model: Model, flow: Flow, c: wp.int32):
+        """Where the places of a cell's nodes end that contacts can load."""
         last = model.first_flagellum[c + 1] - 1
-        return model.first_node[first], flow.start[last] + flow.loaded[last]
+        return flow.start[last] + flow.loaded[last]
 
     @wp.func_native(_ROW)
-    def add_kept_row(s: ContactFlow, row: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32): ...
+    def add_kept_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32): ...
 
     @wp.func(module=module)
-    def add(model: Model, flow: ContactFlow, c: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32):
-        if wp.static(kept):
-            first = model.first_node[model.first_flagellum[c]]
-            add_kept_row(flow, row_of(flow, first, c, i), i, begin, end)
-        else:
-            add_row(flow.sum, i, begin, end, single.real(model.pair_radius[c]))
+    def add(model: Model, flow: Flow, c: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32):
+        if begin < end:
+            if wp.static(kept):
+                first = model.first_node[model.first_flagellum[c]]
+                add_kept_row(flow, row_of(flow, first, c, i), i, begin, end)
+            else:
+                add_row(flow.sum, i, begin, end, single.real(model.pair_radius[c]))
 
     @wp.func(module=module)
-    def spread(model: Model, flow: ContactFlow, c: wp.int32):
-        """The sum by halves, where one thread does a whole cell."""
-        begin, stop = sources(model, flow, c)
-        end = model.first_node[model.first_flagellum[c + 1]]
-        end -= model.first_flagellum[c + 1] - model.first_flagellum[c]
+    def spread(model: Model, flow: Flow, c: wp.int32, sources: wp.int32):
+        """The sum by halves, where one thread does a whole cell; beyond the places `sources` nothing is loaded."""
+        begin = model.first_node[model.first_flagellum[c]]
+        end = places_end(model, c)
         i = begin
         while i < end:
-            own = model.flagellum_of[flow.node[i]]
-            own_start = flow.start[own]
-            own_stop = own_start + flow.loaded[own]
+            stop = wp.min(i, sources)
             if wp.static(within and between):
-                add(model, flow, c, i, begin, wp.min(i, stop))
-            elif wp.static(within):
-                add(model, flow, c, i, own_start, wp.min(i, own_stop))
+                add(model, flow, c, i, begin, stop)
             else:
-                add(model, flow, c, i, begin, own_start)
-                if i >= stop:  # not loaded itself, so nobody has counted it yet
-                    add(model, flow, c, i, own_stop, stop)
+                own = model.flagellum_of[flow.node[i]]
+                start = flow.start[own]
+                loaded = start + flow.loaded[own]
+                rest = flow.rest[own]
+                if wp.static(within):
+                    add(model, flow, c, i, start, wp.min(loaded, stop))
+                    add(model, flow, c, i, rest, stop)
+                else:
+                    add(model, flow, c, i, begin, wp.min(start, stop))
+                    add(model, flow, c, i, loaded, wp.min(rest, stop))
             i += 1
 
     @wp.func(module=module)
-    def flow_at(model: Model, flow: ContactFlow, e: wp.int32, k: wp.int32, c: wp.int32):
-        """Velocity of node e of flagellum k that the loads cause through the pair sum [um/s]."""
+    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32):
+        """Velocity of node e of flagellum k that the forces cause through the pair sum [um/s]."""
         i = flow.place[e]
         ux = zero
         uy = zero
@@ -173,35 +180,42 @@ def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
             uy = flow.sum.uy[i]
             uz = flow.sum.uz[i]
         else:
-            begin, stop = sources(model, flow, c)
+            begin = model.first_node[model.first_flagellum[c]]
             radius = single.real(model.pair_radius[c])
-            start = flow.start[k]
-            own_stop = start + flow.loaded[k]
             u = single.vec3(zero)
             if wp.static(within and between):
-                u = gather_pairs(flow.sum, i, begin, stop, radius)
-            elif wp.static(within):
-                u = gather_pairs(flow.sum, i, start, own_stop, radius)
+                u = gather_pairs(flow.sum, i, begin, sources, radius)
             else:
-                u = gather_pairs(flow.sum, i, begin, start, radius)
-                u += gather_pairs(flow.sum, i, own_stop, stop, radius)
+                start = flow.start[k]
+                loaded = start + flow.loaded[k]
+                rest = flow.rest[k]
+                others = rest + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
+                if wp.static(within):
+                    u = gather_pairs(flow.sum, i, start, wp.min(loaded, sources), radius)
+                    u += gather_pairs(flow.sum, i, rest, wp.min(others, sources), radius)
+                else:
+                    u = gather_pairs(flow.sum, i, begin, wp.min(start, sources), radius)
+                    u += gather_pairs(flow.sum, i, loaded, wp.min(rest, sources), radius)
+                    u += gather_pairs(flow.sum, i, others, sources, radius)
             ux = u[0]
             uy = u[1]
             uz = u[2]
         return model.pair_mobility[c] * vec3(real(ux), real(uy), real(uz))
 
-    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at)
+    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, places_end=places_end)
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
     real = _single(p).real
-    Model, State, Contacts, ContactFlow = structs(p).Model, structs(p).State, contacts.struct(p), struct(p)
-    row_of, module = rows(p), p.module("contact_flow")
+    Model, State, Contacts, Flow = structs(p).Model, structs(p).State, contacts.struct(p), struct(p)
+    row_of, module = rows(p), p.module("flow", "touching" if touching else "")
 
     @wp.func(module=module)
     def may_be_loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
         """Whether node e of a flagellum that ends before `end` has contacts, itself or through its segments."""
+        if wp.static(not touching):
+            return False
         if contacts_in.stop[e] > contacts_in.start[e] or contacts_in.head[e] >= 0:
             return True
         return e + 1 < end and (contacts_in.stop[e + 1] > contacts_in.start[e + 1] or contacts_in.head[e + 1] >= 0)
@@ -214,7 +228,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         # Out:
-        flow: ContactFlow,
+        flow: Flow,
     ):
         k = wp.tid()
         e = model.first_node[k] + 1
@@ -236,7 +250,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
         contacts_in: Contacts,
         # Out:
-        flow: ContactFlow,
+        flow: Flow,
     ):
         own = wp.tid()
         e = model.first_node[own] + 1
@@ -255,6 +269,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 unloaded += model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
             k += 1
         flow.start[own] = loaded
+        flow.rest[own] = unloaded
         while e < end:
             place = loaded
             if may_be_loaded(contacts_in, e, end):
@@ -271,7 +286,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             e += 1
 
     @wp.func_native(_KEEP)
-    def keep_row(s: ContactFlow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
+    def keep_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
 
     @wp.kernel(module=module)
     def keep(
@@ -280,7 +295,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # State:
         state: State,
         # Out:
-        flow: ContactFlow,
+        flow: Flow,
     ):
         c = wp.tid()
         first = model.first_node[model.first_flagellum[c]]
@@ -294,10 +309,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(count=count, arrange=arrange, keep=keep)
 
 
-def build(model: DeviceModel, state: DeviceState, contacts_in: Any, flow: Any) -> None:
-    """Places and positions of the nodes, for loads on those that have contacts."""
-    kernels, device = _kernels(model.precision), model.device
-    inputs = [model.data, state.data, contacts_in, flow]
+def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
+    """Places, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
+    kernels, device = _kernels(model.precision, contacts_in is not None), model.device
+    listed = contacts.struct(model.precision)() if contacts_in is None else contacts_in
+    inputs = [model.data, state.data, listed, flow]
     wp.launch(kernels.count, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.arrange, model.flagellum_count, inputs=inputs, device=device)
     if form_of(model) == "kept":
