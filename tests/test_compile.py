@@ -26,11 +26,12 @@ SWITCHES = {
         "body.contact": False,
         "motor.bearing_torque": False,
     },
+    "short": {"numerics.pair_precision": "float32"},
 }
 STEPPERS = ("rkc", "euler", "implicit")
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
-VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("implicit", "none")]
+VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("rkc", "short"), ("implicit", "none")]
 
 
 def kernels_in_source() -> set[tuple[str, str]]:

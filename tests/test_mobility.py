@@ -12,6 +12,7 @@ from warpflag_kernels import mobility
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
 from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
 from warpflag.drag import pair_radius
+from warpflag.model import switches_of
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
 
@@ -232,6 +233,46 @@ def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypa
     assert halves and not other
     # To round-off of the type.
     assert np.abs(by_halves - gathered).max() < 20 * float(np.finfo(precision).eps) * np.abs(gathered).max()
+
+
+SHORT = {"numerics.pair_precision": "float32"}
+
+
+@pytest.mark.parametrize("form", ["as it comes", "gathered", "strict"])
+@pytest.mark.parametrize("mode", ["within", "between", "all"])
+def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device, monkeypatch):
+    """Terms in float32, sums in float64: more nodes lose no more digits."""
+    if form == "gathered":
+        monkeypatch.setattr(mobility, "sums_by_halves", lambda model: False)
+    scene = cell({"hydrodynamics.mode": mode, "flagella.count": 3, "flagella.segment_length": 0.02})
+    found = []
+    for values, real in (({}, np.float64), (SHORT, np.float32)):
+        sim = Simulation(
+            with_values(scene, values), device=device, starts=shaken(scene, 4, node=0.002), strict=form == "strict"
+        )
+        state = sim.system.state
+        assert len(state.data.position) > 2 * mobility.BLOCK
+        found.append(sim.evaluate().velocities)
+        assert all(a.numpy().dtype == real for a in (state.pairs.x, state.pairs.fz))
+        assert state.data.velocity.numpy().dtype == np.float64
+        by_halves = mobility.sums_by_halves(sim.system.model)
+        assert (state.pairs.total_x is not None) == (by_halves and values == SHORT)
+    error = np.abs(found[1] - found[0]).max() / np.abs(found[0]).max()
+    assert 1e-10 < error < 1e-6
+
+
+def test_pairs_in_float32_keep_the_mobility_symmetric_and_positive_definite(device):
+    scene = touching_cell(SHORT, "float64", 0.03)
+    found = device_mobility(Simulation(scene, device=device, starts=shaken(scene, seed=8, node=0.002, spin=0.0)))
+    assert np.abs(found - found.T).max() < 1e-6 * np.abs(found).max()
+    assert np.linalg.eigvalsh(found).min() > 0.05 / (drag_coefficients(cell())[1] * 0.2)
+
+
+def test_float32_pairs_in_a_float32_run_are_what_it_has_anyway():
+    assert switches_of(cell(SHORT, "float32")) == switches_of(cell({}, "float32"))
+    assert switches_of(cell({**SHORT, "hydrodynamics.mode": "none"})) == switches_of(
+        cell({"hydrodynamics.mode": "none"})
+    )
 
 
 def test_fast_and_strict_builds_agree(device):
