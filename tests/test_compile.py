@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels import mobility
+from warpflag_kernels import banded, mobility
 
 from tests.helpers import cell
 from warpflag.simulation import Simulation
@@ -26,11 +26,12 @@ SWITCHES = {
         "body.contact": False,
         "motor.bearing_torque": False,
     },
+    "short": {"numerics.pair_precision": "float32"},
 }
 STEPPERS = ("rkc", "euler", "implicit")
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
-VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("implicit", "none")]
+VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("rkc", "short"), ("implicit", "none")]
 
 
 def kernels_in_source() -> set[tuple[str, str]]:
@@ -48,7 +49,7 @@ def launched(
 ) -> set[Any]:
     """Kernels that a run of this kind launches, without compiling or running one.
 
-    halves: with the pair sum as a CPU takes it.
+    halves: with the pair sum and the body's columns as a CPU takes them.
     """
     kernels = set()
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
@@ -56,6 +57,7 @@ def launched(
     with monkeypatch.context() as patch:
         if not halves:
             patch.setattr(mobility, "sums_by_halves", lambda model: False)
+            patch.setattr(banded, "columns_apart", lambda model: True)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:

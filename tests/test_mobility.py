@@ -12,6 +12,7 @@ from warpflag_kernels import mobility
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
 from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
 from warpflag.drag import pair_radius
+from warpflag.model import switches_of
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
 
@@ -234,10 +235,52 @@ def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypa
     assert np.abs(by_halves - gathered).max() < 20 * float(np.finfo(precision).eps) * np.abs(gathered).max()
 
 
-def test_fast_and_strict_builds_agree(device):
+SHORT = {"numerics.pair_precision": "float32"}
+
+
+@pytest.mark.parametrize("form", ["as it comes", "gathered", "strict"])
+@pytest.mark.parametrize("mode", ["within", "between", "all"])
+def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device, monkeypatch):
+    """Terms in float32, sums in float64: more nodes lose no more digits."""
+    if form == "gathered":
+        monkeypatch.setattr(mobility, "sums_by_halves", lambda model: False)
+    scene = cell({"hydrodynamics.mode": mode, "flagella.count": 3, "flagella.segment_length": 0.02})
+    found = []
+    for values, real in (({}, np.float64), (SHORT, np.float32)):
+        sim = Simulation(
+            with_values(scene, values), device=device, starts=shaken(scene, 4, node=0.002), strict=form == "strict"
+        )
+        state = sim.system.state
+        assert len(state.data.position) > 2 * mobility.BLOCK
+        found.append(sim.evaluate().velocities)
+        assert all(a.numpy().dtype == real for a in (state.pairs.x, state.pairs.fz))
+        assert state.data.velocity.numpy().dtype == np.float64
+        by_halves = mobility.sums_by_halves(sim.system.model)
+        assert (state.pairs.total_x is not None) == (by_halves and values == SHORT)
+    error = np.abs(found[1] - found[0]).max() / np.abs(found[0]).max()
+    assert 1e-10 < error < 1e-6
+
+
+def test_pairs_in_float32_keep_the_mobility_symmetric_and_positive_definite(device):
+    scene = touching_cell(SHORT, "float64", 0.03)
+    found = device_mobility(Simulation(scene, device=device, starts=shaken(scene, seed=8, node=0.002, spin=0.0)))
+    assert np.abs(found - found.T).max() < 1e-6 * np.abs(found).max()
+    assert np.linalg.eigvalsh(found).min() > 0.05 / (drag_coefficients(cell())[1] * 0.2)
+
+
+def test_float32_pairs_in_a_float32_run_are_what_it_has_anyway():
+    assert switches_of(cell(SHORT, "float32")) == switches_of(cell({}, "float32"))
+    assert switches_of(cell({**SHORT, "hydrodynamics.mode": "none"})) == switches_of(
+        cell({"hydrodynamics.mode": "none"})
+    )
+
+
+# The implicit stepper finds flows of force changes in single precision.
+@pytest.mark.parametrize("stepper, apart", [("rkc", 1e-9), ("implicit", 1e-8)])
+def test_fast_and_strict_builds_agree(stepper, apart, device):
     """Reassociation and fused operations change the last digits and nothing else: forces and velocities of a state in
     contact, and where the nodes are after a millisecond in which the motors turn nine times."""
-    scene = touching_cell({"numerics.stepper": "implicit", "numerics.time_step": 5e-6})
+    scene = touching_cell({"numerics.stepper": stepper, "numerics.time_step": 5e-6})
     start = shaken(scene, seed=3, node=1e-3, spin=0.01)
     assert (contact_distances(start) < 0.0448).sum() > 10
     fast, strict = (Simulation(scene, device=device, starts=start, strict=s) for s in (False, True))
@@ -248,6 +291,6 @@ def test_fast_and_strict_builds_agree(device):
     for sim in (fast, strict):
         sim.advance(1e-3)
     x, y = fast.cell_state(), strict.cell_state()
-    assert np.abs(x.positions - y.positions).max() < 1e-9 * np.abs(y.positions).max()
-    assert np.abs(x.directors - y.directors).max() < 1e-9
+    assert np.abs(x.positions - y.positions).max() < apart * np.abs(y.positions).max()
+    assert np.abs(x.directors - y.directors).max() < 5 * apart
     assert y.motor_angle.min() > 9 * 2 * math.pi

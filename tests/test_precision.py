@@ -1,4 +1,5 @@
-"""float32 follows float64, near the origin and a millimetre away from it: positions are relative to the body."""
+"""float32 follows float64, near the origin and a millimetre away from it: positions are relative to the body. All
+numbers in float32, or those of the pair sum alone."""
 
 from __future__ import annotations
 
@@ -21,10 +22,11 @@ FAR = np.array([600.0, -500.0, 624.5])  # um; a millimetre
 
 
 @cache
-def run(stepper: str, precision: str, far: bool, device: str) -> CellState:
+def run(stepper: str, precision: str, far: bool, device: str, pairs: str = "same") -> CellState:
     """The zipping scene after 2 ms, its body starting at the origin or far from it."""
     step = {"rkc": 1e-5, "implicit": 5e-6}[stepper]
-    values = {"numerics.stepper": stepper, "numerics.precision": precision, "numerics.time_step": step}
+    values = {"stepper": stepper, "precision": precision, "time_step": step, "pair_precision": pairs}
+    values = {f"numerics.{name}": value for name, value in values.items()}
     scene: Scene = with_values(ZIPPING, values)
     start = initial_state(scene)
     if far:
@@ -46,6 +48,16 @@ def test_both_precisions_give_the_same_run_wherever_it_starts(stepper, far, devi
     assert np.abs(found.directors - exact.directors).max() < 100 * TOLERANCE[precision]
     assert np.abs(found.motor_angle - exact.motor_angle).max() < 100 * TOLERANCE[precision]
     assert exact.motor_angle.min() > 6.0  # about two turns
+
+
+@pytest.mark.parametrize("far", [False, True], ids=["origin", "millimetre"])
+@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
+def test_pairs_in_float32_leave_the_run_where_it_was(stepper, far, device):
+    exact, found = run(stepper, "float64", False, device), run(stepper, "float64", far, device, "float32")
+    place = FAR if far else np.zeros(3)
+    distance = np.abs(found.positions - place - exact.positions).max()
+    assert 1e-12 < distance < 1e-6
+    assert np.abs(found.motor_angle - exact.motor_angle).max() < 1e-6
 
 
 def test_slow_motion_adds_up_in_float32(device):

@@ -120,6 +120,7 @@ REFUSED = [
     ("[body]\nwidth = 3.0", "body.width", ["body.length = 2.5"]),
     ("[numerics]\nstepper = 'rk4'", "numerics.stepper", ["euler, rkc, implicit"]),
     ("[numerics]\nprecision = 64", "numerics.precision", ["float64, float32"]),
+    ("[numerics]\npair_precision = 'float64'", "numerics.pair_precision", ["same, float32"]),
     ("duration = 1e-5\n[numerics]\ntime_step = 2e-5", "numerics.time_step", ["above duration = 1e-05 s"]),
     ("[start]\nframe = 3", "start.frame", ["needs start.record"]),
     ("[start]\nrecord = ''", "start.record", ["not empty"]),

@@ -27,11 +27,13 @@ def switches_of(scene: Scene) -> Switches:
     pairs = _PAIRS.get(scene.hydrodynamics.mode, scene.hydrodynamics.mode)
     if alone:
         pairs = {"all": "within", "between": "none"}.get(pairs, pairs)
+    numerics = scene.numerics
     return Switches(
         pairs=pairs,
         steric=scene.steric.enabled and not alone,
         body_contact=scene.body.contact,
         bearing_torque=scene.motor.bearing_torque,
+        short_pairs=pairs != "none" and (numerics.precision, numerics.pair_precision) == ("float64", "float32"),
     )
 
 
@@ -133,12 +135,14 @@ def build_state(model: DeviceModel) -> DeviceState:
     s.spin_torque = zeros(elements, p.real)
     s.flagellum_force, s.flagellum_torque = zeros(flagella, p.vec3), zeros(flagella, p.vec3)
     s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
-    pairs = structs(p).PairSum()
+    pairs, real = structs(model.pair_precision).PairSum(), model.pair_precision.real
     if model.switches.pairs != "none":
         for name in ("x", "y", "z", "fx", "fy", "fz"):
-            setattr(pairs, name, zeros(elements, p.real))
+            setattr(pairs, name, zeros(elements, real))
         if mobility.sums_by_halves(model):
-            pairs.ux, pairs.uy, pairs.uz = (zeros(elements, p.real) for _ in range(3))
+            pairs.ux, pairs.uy, pairs.uz = (zeros(elements, real) for _ in range(3))
+            if model.switches.short_pairs:
+                pairs.total_x, pairs.total_y, pairs.total_z = (zeros(elements, wp.float64) for _ in range(3))
     near = structs(p).Neighbours()
     if model.switches.steric:
         near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale

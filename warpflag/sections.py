@@ -200,6 +200,11 @@ class Numerics(Section, key="numerics"):
         "wanted node error per simulated ms",
         derived="5e-3 with implicit; rkc takes fixed steps of 1e-5 s",
     )
+    pair_precision: str = choice(
+        "same",
+        ("same", "float32"),
+        "numbers of the flow of one pair; float32: those alone, added up in numerics.precision",
+    )
 
 
 @dataclass(frozen=True)

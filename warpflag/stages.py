@@ -26,7 +26,8 @@ def right_hand_side(switches: Switches) -> tuple[Stage, ...]:
         stages.append(Stage("steric", steric.segment_contact))
     if switches.body_contact:
         stages.append(Stage("body contact", steric.body_contact))
-    pairs = "local drag" if switches.pairs == "none" else f"local drag and pair sum ({switches.pairs})"
+    terms = switches.pairs + (", terms in float32" if switches.short_pairs else "")
+    pairs = "local drag" if switches.pairs == "none" else f"local drag and pair sum ({terms})"
     stages += [
         Stage("forces", forces.total_forces),
         Stage("body", body.body_motion),

@@ -5,8 +5,8 @@
 
 Node positions and forces in, node velocities out: warpflag's stage "local drag and pair sum" (so with the drag, and
 over the anchors as well, which the others need not know), replayed by a captured loop as in a run; C++ of
-pair_sum.cpp, compiled here with g++ -O3 -march=native -ffast-math, over all pairs and over i < j only; numba with fast
-maths and the same loop as the C++; PyStokes' Rbm.mobilityTT, which is double precision, has no form for overlapping
+pair_sum.cpp, compiled here with g++ -O3 -march=native -ffast-math, over all pairs and over i < j only; numba, written
+plainly and tuned (numba_sum.py); PyStokes' Rbm.mobilityTT, which is double precision, has no form for overlapping
 spheres and is called from Python once per sum. What is not installed is left out.
 
 Before timing, all must give the same velocities (1e-10 in float64, 1e-4 in float32, of the largest): at the scene's
@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numba_sum
 import numpy as np
 from cells import moving_nodes, placed, shaken, spread
 from harness import Contender, Repeated, interleaved, save_plot, table
@@ -43,7 +44,7 @@ SIZES = {60: (2, 30), 100: (2, 50), 200: (4, 50), 1000: (10, 100), 4000: (40, 10
 PRECISIONS = ("float64", "float32")
 TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 OVERLAPPING = 0.15  # um, a radius at which neighbours of 0.2 um overlap
-CONTENDERS = ("C++", "C++ i<j", "numba", "PyStokes")
+CONTENDERS = ("C++", "C++ i<j", "numba, plain", "numba, tuned", "PyStokes")
 
 
 @dataclass(frozen=True)
@@ -98,70 +99,6 @@ def local_drag(scene: Scene, positions: np.ndarray, forces: np.ndarray, first_no
     return np.concatenate(velocities)
 
 
-def numba_sum() -> Callable[..., None] | None:
-    """The loops of pair_sum.cpp in numba."""
-    try:
-        import numba
-    except ImportError:
-        return None
-    compiled = numba.njit(fastmath=True, error_model="numpy")
-
-    @compiled
-    def part(xi, yi, zi, x, y, z, fx, fy, fz, radius, one, two, third):
-        """Flow of some nodes at a point; constants come in, since a literal would turn float32 into float64."""
-        a2 = radius * radius
-        near = two * two * a2
-        contact = two * two * third / radius
-        slope = (one + one / two) / (two * two) / a2
-        vx = vy = vz = one - one
-        for j in range(len(x)):  # whole arrays: an index that starts anywhere would be checked for its sign
-            dx, dy, dz = xi - x[j], yi - y[j], zi - z[j]
-            r2 = dx * dx + dy * dy + dz * dz
-            inverse = one / np.sqrt(r2)
-            q = a2 * inverse * inverse
-            far_isotropic = inverse * (one + two * third * q)
-            far_along = inverse * inverse * inverse * (one - two * q)
-            isotropic = far_isotropic if r2 > near else contact - slope * r2 * inverse
-            along = far_along if r2 > near else slope * third * inverse
-            along *= dx * fx[j] + dy * fy[j] + dz * fz[j]
-            vx += isotropic * fx[j] + along * dx
-            vy += isotropic * fy[j] + along * dy
-            vz += isotropic * fz[j] + along * dz
-        return vx, vy, vz
-
-    @compiled
-    def repeated(repeats, x, y, z, fx, fy, fz, v, a):
-        one, two, third = a.dtype.type(1), a.dtype.type(2), a.dtype.type(1 / 3)
-        for _ in range(repeats):
-            for i in range(len(x)):
-                at = (x[i], y[i], z[i])
-                before = part(*at, x[:i], y[:i], z[:i], fx[:i], fy[:i], fz[:i], a[0], one, two, third)
-                k = i + 1
-                after = part(*at, x[k:], y[k:], z[k:], fx[k:], fy[k:], fz[k:], a[0], one, two, third)
-                for axis in range(3):
-                    v[axis, i] = before[axis] + after[axis]
-
-    return repeated
-
-
-class NumbaPairSum:
-    """As `NativePairSum`, in numba."""
-
-    def __init__(self, function: Callable[..., None], given: Case) -> None:
-        rows = [np.ascontiguousarray(a.T, dtype=given.precision) for a in (given.positions, given.forces)]
-        self._v = np.zeros_like(rows[0])
-        radius = np.array([given.radius], dtype=given.precision)  # an array, so that its type is known inside
-        self._arguments = [*rows[0], *rows[1], self._v, radius]
-        self._function = function
-
-    def __call__(self, repeats: int) -> None:
-        self._function(repeats, *self._arguments)
-
-    @property
-    def velocities(self) -> np.ndarray:
-        return self._v.T.astype(np.float64)
-
-
 class StokesPairSum:
     """As `NativePairSum`, in PyStokes."""
 
@@ -188,9 +125,10 @@ def peers(given: Case, far_only: bool = True) -> Iterator[tuple[str, Any]]:
     if compiler():
         for name, symmetric in (("C++", False), ("C++ i<j", True)):
             yield name, NativePairSum(given.positions, given.forces, given.radius, given.precision, symmetric)
-    function = numba_sum()
-    if function is not None:
-        yield "numba", NumbaPairSum(function, given)
+    if numba_sum.available():
+        arrays = (given.positions, given.forces, given.radius, given.precision)
+        yield "numba, plain", numba_sum.PlainPairSum(*arrays)
+        yield "numba, tuned", numba_sum.TunedPairSum(*arrays)
     if far_only:
         try:
             import pystokes

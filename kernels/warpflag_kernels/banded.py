@@ -103,14 +103,15 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
     Increment = chain.types(p).Increment
     t = types(p)
     mat44, mat46, mat66, vec6, Band = t.mat44, t.mat46, t.mat66, t.vec6, t.Band
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     body_mobility, solve_flagellum = functions(p).body_mobility, functions(p).solve_flagellum
-    module = p.module("banded", "bearing" if bearing_torque else "")
+    columns = vec4 if apart else mat46
+    module = p.module("banded", ("bearing" if bearing_torque else "") + ("_apart" if apart else ""))
 
     @wp.func(module=module)
     def block(xx: p.mat33, x_spin: vec3, spin_x: vec3, spin: real):
@@ -321,6 +322,31 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
             c1_before = c1
             i += 1
 
+    # An index that is only known at run time would put a loaded block on the stack, in Warp's own words.
+    @wp.func_native("return blocks.data[i].data[row][column];")
+    def component(blocks: wp.array(dtype=mat46), i: wp.int32, row: wp.int32, column: wp.int32) -> real: ...
+
+    @wp.func(module=module)
+    def own_columns(blocks: wp.array(dtype=mat46), i: wp.int32, column: wp.int32):
+        """What a thread that begins at this column handles of block i."""
+        if wp.static(apart):
+            return vec4(
+                component(blocks, i, 0, column),
+                component(blocks, i, 1, column),
+                component(blocks, i, 2, column),
+                component(blocks, i, 3, column),
+            )
+        else:
+            return blocks[i]
+
+    @wp.func(module=module)
+    def set_own_columns(blocks: wp.array(dtype=mat46), i: wp.int32, column: wp.int32, y: columns):
+        if wp.static(apart):
+            for row in range(4):
+                blocks[i][row, column] = y[row]
+        else:
+            blocks[i] = y
+
     @wp.kernel(module=module)
     def body_columns(
         # Model:
@@ -330,49 +356,54 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         # Out:
         band: Band,
     ):
-        k = wp.tid()
+        thread = wp.tid()
+        k = thread / wp.static(6 if apart else 1)
+        column = thread % wp.static(6 if apart else 1)
         first = model.first_node[k]
         end = model.first_node[k + 1]
         c = model.cell_of[first]
         if state.active[c] == 0:
             return
         s = real(band.weight[c])
-        y1 = mat46(real(0.0))
-        y2 = mat46(real(0.0))
+        y1 = columns(real(0.0))
+        y2 = columns(real(0.0))
         i = first
         while i < end:
-            y = mat46(real(0.0))
+            y = columns(real(0.0))
             if i < first + 3:
-                y = s * band.to_body[3 * k + i - first]
+                y = s * own_columns(band.to_body, 3 * k + i - first, column)
             if i > first:
                 y -= band.lower1[i] * y1
             if i > first + 1:
                 y -= band.lower2[i] * y2
             y = band.diagonal[i] * y
-            band.body_columns[i] = y
+            set_own_columns(band.body_columns, i, column, y)
             y2 = y1
             y1 = y
             i += 1
-        y1 = mat46(real(0.0))
-        y2 = mat46(real(0.0))
+        y1 = columns(real(0.0))
+        y2 = columns(real(0.0))
         i = end - 1
         while i >= first:
-            y = band.body_columns[i]
+            y = own_columns(band.body_columns, i, column)
             if i + 1 < end:
                 y -= wp.transpose(band.lower1[i + 1]) * y1
             if i + 2 < end:
                 y -= wp.transpose(band.lower2[i + 2]) * y2
             y = wp.transpose(band.diagonal[i]) * y
-            band.body_columns[i] = y
+            set_own_columns(band.body_columns, i, column, y)
             y2 = y1
             y1 = y
             i -= 1
         # The flagellum's share of H_bb - H_bf W.
-        shared = band.body_block[k]
-        shared -= wp.transpose(band.from_body[3 * k]) * band.body_columns[first]
-        shared -= wp.transpose(band.from_body[3 * k + 1]) * band.body_columns[first + 1]
-        shared -= wp.transpose(band.from_body[3 * k + 2]) * band.body_columns[first + 2]
-        band.body_block[k] = shared
+        shared = wp.transpose(band.from_body[3 * k]) * own_columns(band.body_columns, first, column)
+        shared += wp.transpose(band.from_body[3 * k + 1]) * own_columns(band.body_columns, first + 1, column)
+        shared += wp.transpose(band.from_body[3 * k + 2]) * own_columns(band.body_columns, first + 2, column)
+        if wp.static(apart):
+            for row in range(6):
+                band.body_block[k][row, column] -= shared[row]
+        else:
+            band.body_block[k] -= shared
 
     @wp.func(module=module)
     def inverse6(a: mat66):
@@ -516,22 +547,31 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
     )
 
 
+def columns_apart(model: DeviceModel) -> bool:
+    """Whether each of the body's six columns has a thread: all in one fill the registers of a GPU beyond the brim."""
+    return not model.device.is_cpu
+
+
+def _kernels_for(model: DeviceModel) -> SimpleNamespace:
+    return _kernels(model.precision, model.switches.bearing_torque, columns_apart(model))
+
+
 def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any) -> None:
     """Assembles and factorises the system of every flagellum and body; `singular` tells of a failed pivot."""
-    kernels = _kernels(model.precision, model.switches.bearing_torque)
+    kernels, apart = _kernels_for(model), columns_apart(model)
     device = model.device
     inputs = [model.data, state.data, stiffness, band]
     wp.launch(kernels.assemble, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.couple_body, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band]
     wp.launch(kernels.factorise, model.flagellum_count, inputs=inputs, device=device)
-    wp.launch(kernels.body_columns, model.flagellum_count, inputs=inputs, device=device)
+    wp.launch(kernels.body_columns, model.flagellum_count * (6 if apart else 1), inputs=inputs, device=device)
     wp.launch(kernels.factorise_bodies, model.cell_count, inputs=inputs, device=device)
 
 
 def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
     """P: from D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place."""
-    kernels = _kernels(model.precision, model.switches.bearing_torque)
+    kernels = _kernels_for(model)
     inputs, device = [model.data, state.data, band, x], model.device
     wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.solve_bodies, model.cell_count, inputs=inputs, device=device)

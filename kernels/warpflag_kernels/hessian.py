@@ -88,78 +88,62 @@ def _kernels(p: Precision) -> SimpleNamespace:
             c3 = model.hook_rigidity[k] / h
             w3 = twist
         m3 = c3 * w3
-        # Twist.
-        te = t + tm
-        tf = u + tm
-        cc = c3 * quarter
-        kk = wp.outer(kb, kb)
-        ee = cc * kk - (m3 * quarter) * symmetric(kb, te)
-        ff = cc * kk - (m3 * quarter) * symmetric(kb, tf)
-        fe = cc * kk - (m3 / chi) * wp.skew(t) - (m3 * half) * wp.outer(tm, kb)
-        e_spin = (half * c3) * kb
-        e1 = -e_spin
-        e2 = e_spin
-        f1 = -e_spin
-        f2 = e_spin
-        s11 = c3
-        s12 = -c3
-        s22 = c3
+        # Bending; the hook has none.
+        c = real(0.0)
+        m1 = real(0.0)
+        m2 = real(0.0)
+        a2 = wp.cross(t, a1)
+        b2 = wp.cross(u, b1)
+        w1 = half * wp.dot(kb, a1 + b1)
+        w2 = half * wp.dot(kb, a2 + b2)
         if i > first:
-            a2 = wp.cross(t, a1)
-            b2 = wp.cross(u, b1)
             c = model.bending_rigidity[k] / h
-            w1 = half * wp.dot(kb, a1 + b1)
-            w2 = half * wp.dot(kb, a2 + b2)
             m1 = c * (w1 - model.rest_strain[k][0])
             m2 = c * (w2 - model.rest_strain[k][1])
-            d1 = (a1 + b1) / chi
-            d2 = (a2 + b2) / chi
-            # Gradients of w1, w2 with respect to e and f, times the segment's length.
-            g1e = wp.cross(u, d1) - w1 * tm
-            g2e = wp.cross(u, d2) - w2 * tm
-            g1f = -wp.cross(t, d1) - w1 * tm
-            g2f = -wp.cross(t, d2) - w2 * tm
-            # ... and to the spins.
-            ka1 = half * wp.dot(kb, a1)
-            ka2 = half * wp.dot(kb, a2)
-            kb1 = half * wp.dot(kb, b1)
-            kb2 = half * wp.dot(kb, b2)
-            big_w = m1 * w1 + m2 * w2
-            se = m1 * a1 + m2 * a2
-            sf = m1 * b1 + m2 * b2
-            sm = (se + sf) / chi
-            us = wp.cross(u, sm)
-            ts = wp.cross(t, sm)
-            tmtm = wp.outer(tm, tm)
-            ee += c * (wp.outer(g1e, g1e) + wp.outer(g2e, g2e))
-            ee += (real(2.0) * big_w) * tmtm - symmetric(us, tm) - (big_w / chi) * (identity - tt)
-            ee += quarter * symmetric(kb, se)
-            ff += c * (wp.outer(g1f, g1f) + wp.outer(g2f, g2f))
-            ff += (real(2.0) * big_w) * tmtm + symmetric(ts, tm)
-            ff += quarter * symmetric(kb, sf) - (big_w / chi) * (identity - wp.outer(u, u))
-            fe += c * (wp.outer(g1f, g1e) + wp.outer(g2f, g2e))
-            fe += (real(2.0) * big_w) * tmtm - wp.outer(tm, us) + wp.outer(ts, tm) + wp.skew(sm)
-            fe -= (big_w / chi) * (identity + wp.outer(u, t))
-            # Spins: a turn takes e1 to e2 and e2 to -e1.
-            ra = m1 * a2 - m2 * a1
-            rb = m1 * b2 - m2 * b1
-            kra = half * wp.dot(kb, ra)
-            krb = half * wp.dot(kb, rb)
-            e1 += c * (ka2 * g1e - ka1 * g2e) - kra * tm + wp.cross(u, ra) / chi
-            e2 += c * (kb2 * g1e - kb1 * g2e) - krb * tm + wp.cross(u, rb) / chi
-            f1 += c * (ka2 * g1f - ka1 * g2f) - kra * tm - wp.cross(t, ra) / chi
-            f2 += c * (kb2 * g1f - kb1 * g2f) - krb * tm - wp.cross(t, rb) / chi
-            s11 += c * (ka2 * ka2 + ka1 * ka1) - half * wp.dot(kb, se)
-            s12 += c * (ka2 * kb2 + ka1 * kb1)
-            s22 += c * (kb2 * kb2 + kb1 * kb1) - half * wp.dot(kb, sf)
+        d1 = (a1 + b1) / chi
+        d2 = (a2 + b2) / chi
+        # Derivatives of w1, w2 with respect to the spins.
+        ka1 = half * wp.dot(kb, a1)
+        ka2 = half * wp.dot(kb, a2)
+        kb1 = half * wp.dot(kb, b1)
+        kb2 = half * wp.dot(kb, b2)
+        big_w = m1 * w1 + m2 * w2
+        se = m1 * a1 + m2 * a2
+        sf = m1 * b1 + m2 * b2
+        stiffness.spins[i] = vec3(
+            c3 + c * (ka2 * ka2 + ka1 * ka1) - half * wp.dot(kb, se),
+            c * (ka2 * kb2 + ka1 * kb1) - c3,
+            c3 + c * (kb2 * kb2 + kb1 * kb1) - half * wp.dot(kb, sf),
+        )
+        # A turn takes e1 to e2 and e2 to -e1.
+        ra = m1 * a2 - m2 * a1
+        rb = m1 * b2 - m2 * b1
+        along_first = (half * c3) * kb + (half * wp.dot(kb, ra)) * tm
+        along_second = (half * c3) * kb - (half * wp.dot(kb, rb)) * tm
+        sm = (se + sf) / chi
+        both = (c3 * quarter) * wp.outer(kb, kb) + (real(2.0) * big_w) * wp.outer(tm, tm)
+        # Gradients of w1, w2 with respect to e, times the segment's length; what is known is written at once, since
+        # all the results together would not fit into the registers of a GPU.
+        g1e = wp.cross(u, d1) - w1 * tm
+        g2e = wp.cross(u, d2) - w2 * tm
+        us = wp.cross(u, sm)
+        ee = both + c * (wp.outer(g1e, g1e) + wp.outer(g2e, g2e)) - (big_w / chi) * (identity - tt)
+        ee -= symmetric(us, tm) + symmetric(kb, quarter * (m3 * (t + tm) - se))
         stiffness.ee[i] = ee / (le * le)
+        stiffness.e_first[i] = (c * (ka2 * g1e - ka1 * g2e) - along_first + wp.cross(u, ra) / chi) / le
+        stiffness.e_second[i] = (c * (kb2 * g1e - kb1 * g2e) + along_second + wp.cross(u, rb) / chi) / le
+        # ... and to f.
+        g1f = -wp.cross(t, d1) - w1 * tm
+        g2f = -wp.cross(t, d2) - w2 * tm
+        ts = wp.cross(t, sm)
+        ff = both + c * (wp.outer(g1f, g1f) + wp.outer(g2f, g2f)) - (big_w / chi) * (identity - wp.outer(u, u))
+        ff += symmetric(ts, tm) - symmetric(kb, quarter * (m3 * (u + tm) - sf))
         stiffness.ff[i] = ff / (lf * lf)
+        stiffness.f_first[i] = (c * (ka2 * g1f - ka1 * g2f) - along_first - wp.cross(t, ra) / chi) / lf
+        stiffness.f_second[i] = (c * (kb2 * g1f - kb1 * g2f) + along_second - wp.cross(t, rb) / chi) / lf
+        fe = both + c * (wp.outer(g1f, g1e) + wp.outer(g2f, g2e)) - (big_w / chi) * (identity + wp.outer(u, t))
+        fe += wp.outer(ts, tm) - wp.outer(tm, us + (m3 * half) * kb) + wp.skew(sm - (m3 / chi) * t)
         stiffness.fe[i] = fe / (le * lf)
-        stiffness.e_first[i] = e1 / le
-        stiffness.e_second[i] = e2 / le
-        stiffness.f_first[i] = f1 / lf
-        stiffness.f_second[i] = f2 / lf
-        stiffness.spins[i] = vec3(s11, s12, s22)
 
     return SimpleNamespace(joints=joints)
 

@@ -11,6 +11,8 @@ body: it moves with the body and its force enters the sum as zero.
 
 Every thread gathers the flows at its own node. A CPU, where one thread does a whole cell, takes every pair once for
 both nodes instead, half the square roots for the same sum.
+
+A float64 run may have its pairs in float32: `BLOCK` terms are then added up in float32, and such sums in float64.
 """
 
 import functools
@@ -40,6 +42,8 @@ def pair_coefficients(p: Precision):
     return rotne_prager
 
 
+BLOCK = 64  # with fewer, float64 additions begin to show in the time; with more, float32 ones in the error
+
 # One row of the sum by halves: pairs (i, j) for j in [begin, end), counted at both nodes. A loop that adds to what it
 # reads is vectorised only if the compiler is told that no two rows overlap, which takes C++; the body is that of
 # `gather_pairs`.
@@ -67,6 +71,18 @@ _ROW = """
         U[j] += ci * fi + di * dx; V[j] += ci * gi + di * dy; W[j] += ci * hi + di * dz;
     }
     U[i] += ui; V[i] += vi; W[i] += wi;
+"""
+
+
+# Moves the float32 sums of nodes [begin, end) into the float64 ones.
+_FLUSH = """
+    float* __restrict__ U = s.ux.data; float* __restrict__ V = s.uy.data; float* __restrict__ W = s.uz.data;
+    double* __restrict__ X = s.total_x.data; double* __restrict__ Y = s.total_y.data;
+    double* __restrict__ Z = s.total_z.data;
+    for (int j = begin; j < end; ++j) {
+        X[j] += U[j]; Y[j] += V[j]; Z[j] += W[j];
+        U[j] = 0; V[j] = 0; W[j] = 0;
+    }
 """
 
 
@@ -123,25 +139,25 @@ def pair_rows(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
-    Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
-    module = p.module("mobility", pairs + ("_halves" if halves else ""))
+def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
+    module = p.module("mobility", pairs + ("_halves" if halves else "") + ("_short" if short else ""))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
-    add_row, gather_pairs = pair_rows(p).add_row, pair_rows(p).gather_pairs
+    add_row, gather_pairs = pair_rows(pair).add_row, pair_rows(pair).gather_pairs
 
     @wp.func(module=module)
     def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
         x = state.position[e]
         force = state.force[e]
         if e == model.first_node[model.flagellum_of[e]]:
-            force = vec3(real(0.0))
-        s.x[e] = x[0]
-        s.y[e] = x[1]
-        s.z[e] = x[2]
-        s.fx[e] = force[0]
-        s.fy[e] = force[1]
-        s.fz[e] = force[2]
+            force = vec3(p.real(0.0))
+        s.x[e] = real(x[0])
+        s.y[e] = real(x[1])
+        s.z[e] = real(x[2])
+        s.fx[e] = real(force[0])
+        s.fy[e] = real(force[1])
+        s.fz[e] = real(force[2])
 
     @wp.kernel(module=module)
     def pack(
@@ -153,6 +169,9 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         s: PairSum,
     ):
         pack_node(model, state, s, wp.tid())
+
+    @wp.func_native(_FLUSH)
+    def flush(s: PairSum, begin: wp.int32, end: wp.int32): ...
 
     @wp.kernel(module=module)
     def add_rows(
@@ -168,24 +187,54 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             return
         begin = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
+        a = real(model.pair_radius[c])
         i = begin
         while i < end:
             pack_node(model, state, s, i)
             s.ux[i] = real(0.0)
             s.uy[i] = real(0.0)
             s.uz[i] = real(0.0)
+            if wp.static(short):
+                s.total_x[i] = wp.float64(0.0)
+                s.total_y[i] = wp.float64(0.0)
+                s.total_z[i] = wp.float64(0.0)
             i += 1
         i = begin
         while i < end:
             own = model.first_node[model.flagellum_of[i]]
             if i > own:
                 if wp.static(within and between):
-                    add_row(s, i, begin, i, model.pair_radius[c])
+                    add_row(s, i, begin, i, a)
                 elif wp.static(within):
-                    add_row(s, i, own, i, model.pair_radius[c])
+                    add_row(s, i, own, i, a)
                 else:
-                    add_row(s, i, begin, own, model.pair_radius[c])
+                    add_row(s, i, begin, own, a)
             i += 1
+            if wp.static(short):
+                rows = i - begin
+                if rows % wp.static(BLOCK) == 0 or i == end:
+                    flush(s, begin, i)
+
+    @wp.func(module=module)
+    def gather_blocks(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
+        """The same in the run's precision."""
+        total = vec3()
+        j = begin
+        while j < end:
+            part = gather_pairs(s, i, j, wp.min(j + wp.static(BLOCK), end), a)
+            total += vec3(p.real(part[0]), p.real(part[1]), p.real(part[2]))
+            j += wp.static(BLOCK)
+        return total
+
+    gather = gather_blocks if short else gather_pairs
+
+    @wp.func(module=module)
+    def summed(s: PairSum, e: wp.int32):
+        """What the sum by halves found, in the run's precision."""
+        if wp.static(short):
+            return vec3(s.total_x[e], s.total_y[e], s.total_z[e])
+        else:
+            return vec3(s.ux[e], s.uy[e], s.uz[e])
 
     @wp.kernel(module=module)
     def velocities(
@@ -206,7 +255,7 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
             return
         t = state.tangent[e]
-        square = real(1.0)
+        square = p.real(1.0)
         if e + 1 < end:
             t += state.tangent[e + 1]
             square = wp.dot(t, t)
@@ -214,22 +263,22 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         along = (wp.dot(t, force) / square) * t
         v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
         if wp.static(halves):
-            v += model.pair_mobility[c] * vec3(s.ux[e], s.uy[e], s.uz[e])
+            v += model.pair_mobility[c] * summed(s, e)
         elif wp.static(pairs != "none"):
-            a = model.pair_radius[c]
-            pair = vec3(real(0.0))
+            a = real(model.pair_radius[c])
+            flow = vec3()
             if wp.static(within and between):
                 cell_begin = model.first_node[model.first_flagellum[c]]
                 cell_end = model.first_node[model.first_flagellum[c + 1]]
-                pair = gather_pairs(s, e, cell_begin, cell_end, a)
+                flow = gather(s, e, cell_begin, cell_end, a)
             elif wp.static(within):
-                pair = gather_pairs(s, e, begin, end, a)
+                flow = gather(s, e, begin, end, a)
             else:
                 cell_begin = model.first_node[model.first_flagellum[c]]
                 cell_end = model.first_node[model.first_flagellum[c + 1]]
-                pair = gather_pairs(s, e, cell_begin, begin, a)
-                pair += gather_pairs(s, e, end, cell_end, a)
-            v += model.pair_mobility[c] * pair
+                flow = gather(s, e, cell_begin, begin, a)
+                flow += gather(s, e, end, cell_end, a)
+            v += model.pair_mobility[c] * flow
         state.velocity[e] = v
 
     return SimpleNamespace(pack=pack, add_rows=add_rows, velocities=velocities)
@@ -243,7 +292,7 @@ def sums_by_halves(model: DeviceModel) -> bool:
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion."""
     halves = sums_by_halves(model)
-    kernels, device = _kernels(model.precision, model.switches.pairs, halves), model.device
+    kernels, device = _kernels(model.precision, model.pair_precision, model.switches.pairs, halves), model.device
     inputs = [model.data, state.data, state.pairs]
     if halves:
         wp.launch(kernels.add_rows, model.cell_count, inputs=inputs, device=device)

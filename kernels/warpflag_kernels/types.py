@@ -155,6 +155,10 @@ def structs(p: Precision) -> SimpleNamespace:
         ux: wp.array(dtype=real)  # 8 pi eta times the velocity [pN/um]; only where pairs are summed by halves
         uy: wp.array(dtype=real)
         uz: wp.array(dtype=real)
+        # What float64 runs add up of it; only where their pairs are float32 and summed by halves.
+        total_x: wp.array(dtype=wp.float64)
+        total_y: wp.array(dtype=wp.float64)
+        total_z: wp.array(dtype=wp.float64)
 
     @wp.struct
     class Neighbours:
@@ -177,12 +181,14 @@ class Switches:
         steric: contact between segments of different flagella.
         body_contact: contact between nodes and the body surface.
         bearing_torque: the hook hands its bearing torque to the body, so the swimmer is torque-free.
+        short_pairs: every pair of the sum in float32, their sums in float64; in a float64 run.
     """
 
     pairs: str
     steric: bool
     body_contact: bool
     bearing_torque: bool
+    short_pairs: bool
 
 
 @dataclass(frozen=True)
@@ -204,10 +210,15 @@ class DeviceModel:
     largest_cell: int
     data: Any
 
+    @property
+    def pair_precision(self) -> Precision:
+        """Of the terms of the pair sum."""
+        return Precision("float32", self.precision.strict) if self.switches.short_pairs else self.precision
+
 
 @dataclass(frozen=True)
 class DeviceState:
-    """State on a device: the structs `State`, `PairSum` and `Neighbours` of this precision."""
+    """State on a device: the structs `State` and `Neighbours` of this precision, `PairSum` of that of the pairs."""
 
     data: Any
     pairs: Any
