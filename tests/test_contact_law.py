@@ -231,8 +231,7 @@ class Listed:
 
     def press(self) -> None:
         s = self.bench.stepper
-        contact_law.press(self.bench.model, self.bench.state, s._contacts, s._law)
-        contacts.act(self.bench.model, self.bench.state, s._contacts, s._law.force)
+        contact_law.press(self.bench.model, self.bench.state, self.bench.increment(), s._contacts, s._law)
 
     def solve(self, start: Any, coarse: float = 1.0) -> np.ndarray:
         """The increment with the answer of the contacts."""
@@ -254,8 +253,7 @@ def listed(b: Bench, step: float = STEP, tolerance: float = FINE) -> Listed:
     s._law.tolerance.fill_(tolerance)
     s._law.failed.zero_()
     find(b)
-    contact_law.press(b.model, b.state, s._contacts, s._law)
-    contacts.act(b.model, b.state, s._contacts, s._law.force)
+    contact_law.press(b.model, b.state, b.increment(), s._contacts, s._law)
     levers, solver = dense_levers(b), dense_solver(b, step, 1.3 * GAIN)
     if b.model.switches.pairs != "none":
         flow.build(b.model, b.state, s._flow, s._contacts)
@@ -347,7 +345,7 @@ def obeyed(l: Listed, start: Any, acting: np.ndarray, given: np.ndarray, x: np.n
     allowed = 1.1 * l.tolerance + FLOW_TOLERANCE[precision] * np.abs(l.compliance @ (force - acting)).max()
     free = given + l.levers.T @ flat(start)
     assert np.abs(gaps - free - l.compliance @ (force - acting)).max() < allowed
-    assert close(x, flat(start) + caused, precision, 1.0, FLOW_TOLERANCE)
+    assert close(x, flat(start) + caused, precision, 3.0, FLOW_TOLERANCE)  # of forces that nearly cancel
     # To the tolerance the solution is the only one.
     exact = dense_solution(free, l.compliance, acting, l.strength)
     assert np.abs(gaps - exact).max() < 5 * allowed
@@ -459,27 +457,6 @@ def pose_gaps(l: Listed, x: Any) -> np.ndarray:
     return np.array(gaps)
 
 
-@pytest.mark.parametrize("name", ["all", "bundle", "no body contact"])
-def test_gaps_measured_in_the_pose_they_lead_to_are_those_of_the_law(name, device, precision):
-    """Measured in the pose of the last increment, then changed linearly by a sweep: what is left is of second order,
-    and nothing once the sweeps have converged."""
-    l = listed(touching(CELLS[name], precision, device, seed=0, separation=0.055))
-    b, s = l.bench, l.bench.stepper
-    drive, free = driven(l, 2.0)
-    found = l.solve(free, coarse=100.0)
-    x = b.increment(found[:6], found[6:].reshape(-1, 4))
-    left = [np.abs(pose_gaps(l, x) - l.own("solved_gap")).max()]
-    for _ in range(25):
-        pose_gaps(l, x)
-        contacts.measure(b.model, b.state, s._trial, s._contacts, s._most_contacts)
-        sweep(l, drive, x)
-        assert not l.failed()
-        left.append(np.abs(pose_gaps(l, x) - l.own("solved_gap")).max())
-    assert left[0] > 1e-5 and left[1] < 0.6 * left[0], left
-    assert left[-1] < 2 * FINE
-    assert l.own("force").max() > 0.5
-
-
 @pytest.mark.parametrize("name", ["all", "none", "three", "bundle", "anchored", "no body contact"])
 def test_sweeps_lead_to_the_solution_with_the_full_mobility(name, device, precision):
     """(1/dt + g M H) x = drive + g M B (F(gap + B^T x) - acting), whatever the matrix and the law leave out of M."""
@@ -510,32 +487,34 @@ def test_sweeps_lead_to_the_solution_with_the_full_mobility(name, device, precis
 
 
 @pytest.mark.parametrize("name", ["all", "bundle", "anchored", "no body contact"])
-def test_forces_act_where_and_along_what_the_pose_says_in_which_gaps_were_measured(name, device, precision):
-    """(1/dt + g M H) x = drive + g M [B' F(gap' + B'^T (x - x')) - B acting], with B', gap' of the pose of x'."""
+def test_contacts_are_those_of_the_pose_that_is_predicted(name, device, precision):
+    """(1/dt + g M H) x = drive + g M B [F(gap + B^T (x - x')) - F(gap)], with B and gap of the pose of x'."""
     l = listed(
         touching(CELLS[name], precision, device, seed=0, separation=0.055),
         tolerance={"float64": 1e-8, "float32": 2e-7}[precision],
     )
-    b, s, acting = l.bench, l.bench.stepper, l.own("force")
+    b, s, before = l.bench, l.bench.stepper, l.levers
     drive, free = driven(l, 2.0)
-    found = l.solve(free)
-    x = b.increment(found[:6], found[6:].reshape(-1, 4))
-    given = pose_gaps(l, x)
-    contacts.measure(b.model, b.state, s._trial, s._contacts, s._most_contacts)
-    turned = dense_levers(b)
-    assert np.abs(turned - l.levers).max() > 0.05 and np.abs(l.own("gap") - given).max() < 1e-6
+    predicted = l.solve(free)
+    x = b.increment(predicted[:6], predicted[6:].reshape(-1, 4))
+    chain.retract(b.model, b.state, s._now, s.data.one, x, s._trial)
+    contacts.find(b.model, s._trial_state, s._trial, s._contacts)
+    contact_law.press(b.model, b.state, x, s._contacts, s._law)
+    flow.build(b.model, b.state, s._flow, s._contacts)
+    l.levers = dense_levers(b)
+    assert l.levers.shape != before.shape or np.abs(l.levers - before).max() > 0.05
+    given, acting = pose_gaps(l, x), l.own("force")
+    assert np.abs(l.own("solved_gap") - given).max() < 1e-6
+    assert np.abs(l.own("gap") + l.levers.T @ predicted - given).max() < 1e-6
+    x = b.increment()
     for _ in range(90):
         sweep(l, drive, x)
     assert not l.failed()
     mobility = b.mobility()
     system = np.eye(len(mobility)) / STEP + GAIN * mobility @ b.hessian()
-    free_of = np.linalg.solve(system, flat(drive) - GAIN * mobility @ l.levers @ acting)
-    columns = np.linalg.solve(system, GAIN * mobility @ turned)
-    at_rest = given + turned.T @ (free_of - found)
-    gaps = dense_solution(at_rest, turned.T @ columns, np.zeros(len(acting)), l.strength)
-    solution = free_of + columns @ steric_force(gaps, l.strength)
-    allowed = {"float64": 1e-5, "float32": 5e-3}[precision] * np.abs(solution).max()
-    assert np.abs(flat(x) - solution).max() < allowed
-    # With the forces along their old directions it would be another.
-    stale = free_of + np.linalg.solve(system, GAIN * mobility @ l.levers @ steric_force(gaps, l.strength))
-    assert np.abs(stale - solution).max() > 10 * allowed
+    free_of, columns = (np.linalg.solve(system, v) for v in (flat(drive), GAIN * mobility @ l.levers))
+    gaps = dense_solution(given + l.levers.T @ (free_of - predicted), l.levers.T @ columns, acting, l.strength)
+    solution = free_of + columns @ (steric_force(gaps, l.strength) - acting)
+    for part in (slice(0, 6), displacements(b), spins(b))[name == "anchored" :]:
+        assert close(flat(x)[part], solution[part], precision, 5.0, FLOW_TOLERANCE)
+    assert l.own("force").max() > 0.5

@@ -39,8 +39,9 @@ def struct(p: Precision) -> Any:
         free_gap: wp.array(dtype=real)
         solved_gap: wp.array(dtype=real)
         residual: wp.array(dtype=real)
+        pressed: wp.array(dtype=real)  # force in the predicted pose [pN]
         force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to [pN]
+        load: wp.array(dtype=real)  # what W is applied to; between solutions: force - pressed [pN]
         change: wp.array(dtype=real)  # W load [um]
         yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
         root: wp.array(dtype=real)  # square root of the stiffness that a contact shows against it

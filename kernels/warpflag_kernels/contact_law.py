@@ -5,7 +5,7 @@ With W the compliance (see `compliance`), the gaps obey
     gap = free + W (F(gap) - acting),
 
 F the steric force, free the gaps that the forces already acting lead to. `press` sets those to begin with: the law at
-the extrapolated gaps, so that only changes have to go through W. Newton's method solves it, and GMRES its linear
+the gaps of the predicted pose, so that only changes have to go through W. Newton's method solves it, and GMRES its linear
 systems (1 + k^1/2 W k^1/2) u = -k^1/2 residual with the stiffness k = -dF/dgap: nothing but products with W is needed,
 each in time proportional to the nodes and contacts. Contacts are soft against what they rest on over one step, so a
 few products are enough, however many contacts there are. An estimate w of a contact's own compliance scales the
@@ -24,14 +24,14 @@ from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 DIRECTIONS = 10  # of GMRES at most
-LEAST_REDUCTION, MOST_REDUCTION = 0.05, 0.001  # of the linear residual, at which GMRES stops
+LEAST_REDUCTION, MOST_REDUCTION = 0.1, 0.001  # of the linear residual, at which GMRES stops
 PATIENCE = 4  # iterations of Newton's method after which it does not stop early: contacts are very stiff
 ITERATIONS = 60  # of Newton's method
 HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
 SETTLED = 1.0e-3  # change at which a contact's own Newton iteration has converged, the next would be its square [sigma]
 STIFFENING = 0.15  # of a contact's compliance from local drag, for what else holds it
-DEEPEST = 0.9  # extrapolated gaps count for no less: what overlaps deeply will have moved apart [sigma]
+DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
 # Dot products with earlier directions, and their removal, are a vector loop only where the compiler is told that
@@ -91,18 +91,22 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         model: Model,
         # State:
         state: State,
-        contacts_in: Contacts,
+        predicted: Increment,
         # Out:
+        contacts_out: Contacts,
         law: Law,
     ):
         c, lane = wp.tid()
         if state.active[c] == 0:
             return
-        i = contacts_in.first[c] + lane
-        while i < contacts_in.first[c] + contacts_in.count[c]:
-            gap = wp.max(contacts_in.gap[i], deepest * model.steric_diameter[c])
-            law.force[i] = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
-            law.solved_gap[i] = contacts_in.gap[i]
+        i = contacts_out.first[c] + lane
+        while i < contacts_out.first[c] + contacts_out.count[c]:
+            gap = contacts_out.gap[i]
+            counted = wp.max(gap, deepest * model.steric_diameter[c])
+            law.pressed[i] = steric_force(counted, model.steric_strength[c], model.steric_diameter[c])
+            law.force[i] = law.pressed[i]
+            law.solved_gap[i] = gap
+            contacts_out.gap[i] = gap - gap_change(model, state, contacts_out, i, predicted)
             i += lanes
 
     @wp.func(module=module)
@@ -335,6 +339,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         i = begin + lane
         while i < stop:
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
+            law.load[i] = law.force[i] - law.pressed[i]
             contacts_in.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
             i += lanes
         e = model.first_node[model.first_flagellum[c]] + lane
@@ -354,9 +359,13 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     return SimpleNamespace(press=press, solve=solve)
 
 
-def press(model: DeviceModel, state: DeviceState, contacts_in: Any, law: Any) -> None:
-    """Forces at the listed gaps, into `force`: where the solution begins."""
-    inputs = [model.data, state.data, contacts_in, law]
+def press(model: DeviceModel, state: DeviceState, predicted: Any, contacts_out: Any, law: Any) -> None:
+    """Forces at the listed gaps, into `force` and `pressed`: where the solution begins.
+
+    Args:
+        predicted: increment to the pose in which the contacts were found; gaps are taken back to the one it begins at.
+    """
+    inputs = [model.data, state.data, predicted, contacts_out, law]
     wp.launch(_kernels_of(model).press, (model.cell_count, _lanes(model)), inputs=inputs, device=model.device)
 
 

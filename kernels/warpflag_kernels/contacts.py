@@ -42,7 +42,6 @@ def struct(p: Precision) -> Any:
         gap: wp.array(dtype=real)  # [capacity], distance of the centre lines, or of the node from the surface [um]
         next: wp.array(dtype=wp.int32)  # [capacity], next with that other side, or of that flagellum with the body
         anchored: wp.array(dtype=wp.int32)  # [capacity], 1: the segment begins at r_0, 2: the other one does, 3: both
-        acting: wp.array(dtype=vec3)  # [E], contact forces on a node that act already [pN]
 
     return Contacts
 
@@ -132,7 +131,7 @@ def functions(p: Precision) -> SimpleNamespace:
             i = contacts_in.next[i]
         return load
 
-    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load, on_body=on_body)
+    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load)
 
 
 @functools.cache
@@ -323,50 +322,13 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         contacts.body_head[k] = head
 
     @wp.kernel(module=module)
-    def measure(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        pose: Pose,
-        # Out:
-        contacts: Contacts,
-    ):
-        c, index = wp.tid()
-        if state.active[c] == 0 or index >= contacts.count[c]:
-            return
-        i = contacts.first[c] + index
-        e = contacts.segment[i]
-        j = contacts.other[i]
-        if j < 0:
-            axis = pose.body_axis[c]
-            half = model.body_half_length[c]
-            y = pose.position[e]
-            away_from_axis = y - wp.clamp(wp.dot(y, axis), -half, half) * axis
-            distance = wp.length(away_from_axis)
-            contacts.gap[i] = distance - model.body_radius[c]
-            contacts.normal[i] = away_from_axis / distance
-        else:
-            p1 = pose.position[e - 1]
-            p2 = pose.position[j - 1]
-            d1 = pose.position[e] - p1
-            d2 = pose.position[j] - p2
-            st = closest_parameters(p1, d1, p2, d2)
-            contacts.at[i] = st[0]
-            contacts.at_other[i] = st[1]
-            apart = p1 + st[0] * d1 - p2 - st[1] * d2
-            r = wp.length(apart)
-            contacts.gap[i] = r
-            contacts.normal[i] = direction(apart, r, d1, d2, model.steric_diameter[c])
-
-    @wp.kernel(module=module)
     def act(
         # Model:
         model: Model,
         # State:
+        contacts: Contacts,
         magnitude: wp.array(dtype=real),
         # Out:
-        contacts: Contacts,
         state: State,
     ):
         e = wp.tid()
@@ -376,7 +338,6 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         if e + 1 < model.first_node[model.flagellum_of[e] + 1]:
             on_first, _after = segment_loads(contacts, magnitude, e + 1)
             load += on_first
-        contacts.acting[e] = load
         state.force[e] = state.force[e] + load
         if wp.static(body):
             i = contacts.stop[e] - 1
@@ -385,7 +346,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 reaction = magnitude[i] * contacts.normal[i]
             state.body_contact[e] = reaction
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, measure=measure, act=act)
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, act=act)
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:
@@ -404,19 +365,8 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> No
     wp.launch(kernels.link, model.flagellum_count, inputs=[model.data, state.data, contacts], device=device)
 
 
-def measure(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any, most: int) -> None:
-    """The gaps of the listed contacts at another pose, and where and along which directions they act there.
-
-    Args:
-        most: launch size, contacts per cell at most.
-    """
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
-    inputs = [model.data, state.data, pose, contacts]
-    wp.launch(kernels.measure, (model.cell_count, most), inputs=inputs, device=model.device)
-
-
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
-    """Adds forces of these magnitudes at the listed contacts [pN] to `force`; sets `acting` and `body_contact`."""
+    """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
-    inputs = [model.data, magnitude, contacts, state.data]
+    inputs = [model.data, contacts, magnitude, state.data]
     wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

@@ -25,8 +25,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
     Contacts, Law = contacts.struct(p), compliance.struct(p)
-    lever = contacts.functions(p)
-    segment_loads, body_load, on_body = lever.segment_loads, lever.body_load, lever.on_body
+    segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
     Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form)
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
     variant = "_".join([*["bearing"] * bearing_torque, *["touching"] * touching, pairs, form])
@@ -98,11 +97,10 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
         force = vec3(real(0.0))
         torque = -state.joint_spin_before[e]
         if wp.static(touching):
-            _before, force = segment_loads(contacts_in, law.force, e)
+            _before, force = segment_loads(contacts_in, law.load, e)
             if e + 1 < model.first_node[k + 1]:
-                on_first, _after = segment_loads(contacts_in, law.force, e + 1)
+                on_first, _after = segment_loads(contacts_in, law.load, e + 1)
                 force += on_first
-            force -= contacts_in.acting[e]
         if e + 1 < model.first_node[k + 1]:
             force += segment_change(model, state, stiffness, x, e + 1, k)
         else:
@@ -130,12 +128,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
         force = state.force[first]
         torque = wp.cross(state.position[first], force)
         if wp.static(touching):
-            load = body_load(model, state, contacts_in, law.force, k, force)
-            i = contacts_in.body_head[k]
-            while i >= 0:
-                e = contacts_in.segment[i]
-                load += on_body(state.body_contact[e], state.position[e])
-                i = contacts_in.next[i]
+            load = body_load(model, state, contacts_in, law.load, k, force)
             force = vec3(load[0], load[1], load[2])
             torque = vec3(load[3], load[4], load[5])
         if wp.static(bearing_torque):

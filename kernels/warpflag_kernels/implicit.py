@@ -6,9 +6,10 @@ evaluates the velocities V there once, and solves for the correction e:
     (1/dt + g M H) e = g [V - w delta/dt] + g M B (F - F_x)
 
 in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
-the explicit flows of the pair sum stable. V holds the contact forces F_x at the extrapolated gaps; those that count,
-F, obey the exact law at the end of the step. Every step is checked before it is taken: solves, guards and the error
-estimate. A step that fails is taken again, shorter.
+the explicit flows of the pair sum stable. Contacts are those of a pose nearer to the end of the step, where a path
+that is quadratic in time leads: V holds their forces F_x at its gaps, and those that count, F, obey the exact law at
+the end of the step. Every step is checked before it is taken: solves, guards and the error estimate. A step that
+fails is taken again, shorter.
 """
 
 import functools
@@ -27,8 +28,8 @@ from warpflag_kernels.types import Precision, structs
 
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
-PEAK = 3.5
-GAP_SHARE = 0.3  # of the error that a step may make, for what the contact law leaves over
+PEAK = 3.3
+GAP_SHARE = 0.5  # of the error that a step may make, for what the contact law leaves over
 
 
 @functools.cache
@@ -146,6 +147,33 @@ def kernels(p: Precision) -> SimpleNamespace:
         x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)
+    def predict(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        last: Increment,
+        before: Increment,
+        # Out:
+        x: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        # On a path that is quadratic in time, as the last two increments say.
+        scale = real(0.0)
+        ratio = real(0.0)
+        if imp.history[c] == 2:
+            w = imp.ratio[c]
+            ratio = real(imp.last_step[c] / imp.step_before[c])
+            scale = real(w * (w + wp.float64(1.0)) / (wp.float64(1.0) + imp.step_before[c] / imp.last_step[c]))
+        x.node[e] = scale * (last.node[e] - ratio * before.node[e])
+        if e == model.first_node[model.first_flagellum[c]]:
+            x.body[c] = scale * (last.body[c] - ratio * before.body[c])
+
+    @wp.kernel(module=module)
     def add_increments(
         # Model:
         model: Model,
@@ -175,7 +203,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp: Implicit,
         band: Band,
         last: Increment,
-        before: Increment,
+        predicted: Increment,
         x: Increment,
         # Out:
         chart: Chart,
@@ -200,13 +228,9 @@ def kernels(p: Precision) -> SimpleNamespace:
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), turn)
         total = real(0.0)
         if imp.history[c] == 2:
-            # Third divided difference of the increments: what a quadratic path leaves over.
-            w = imp.ratio[c]
-            ratio = imp.last_step[c] / imp.step_before[c]
-            scale = real(w * (w + wp.float64(1.0)) / (wp.float64(1.0) + wp.float64(1.0) / ratio))
             e = first + 1
             while e < model.first_node[k + 1]:
-                d = x.node[e] - scale * (last.node[e] - real(ratio) * before.node[e])
+                d = x.node[e] - predicted.node[e]  # third divided difference of the path
                 total += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
                 e += 1
         imp.error[k] = total / real(12.0)
@@ -304,6 +328,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         begin=begin,
         right_hand_side=right_hand_side,
         add_increments=add_increments,
+        predict=predict,
         estimate_error=estimate_error,
         decide=decide,
         keep_elements=keep_elements,

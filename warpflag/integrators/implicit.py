@@ -27,6 +27,7 @@ from warpflag_kernels import (
     mobility,
     stability,
 )
+from warpflag_kernels.types import structs
 
 from warpflag.integrators.stepper import (
     DEFAULT_ACCURACY,
@@ -41,8 +42,8 @@ __all__ = ["ImplicitStepper"]
 
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
-ROUGH = 100.0
-"""How many times their tolerance is enough for gaps that only lead to the pose in which they are measured again."""
+ROUGH = 50.0
+"""How many times their tolerance is enough for gaps that only lead to the defect correction."""
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
 
@@ -77,6 +78,11 @@ class ImplicitStepper:
         for name in ("body_position", "body_orientation", "body_axis"):
             setattr(self._now, name, getattr(s, name))
             setattr(self._trial, name, wp.zeros_like(getattr(s, name)))
+        # The state in the pose in which contacts are looked for.
+        self._trial_state = dataclasses.replace(system.state, data=structs(p).State())
+        self._trial_state.data.assign(s)
+        for name in t.Pose.vars:
+            setattr(self._trial_state.data, name, getattr(self._trial, name))
         self._base.position, self._base.tangent = base.base_position, base.base_tangent
         self._base.director = base.base_director
         self._base.body_position, self._base.body_orientation = base.base_body_position, base.base_body_orientation
@@ -88,7 +94,7 @@ class ImplicitStepper:
 
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
         self._carried, self._carried_before, self._total = (increment() for _ in range(3))
-        self._free_step, self._step = increment(), increment()
+        self._predicted, self._free_step, self._step = (increment() for _ in range(3))
         self._drive, self._defect, self._scratch = (increment() for _ in range(3))
 
         k = hessian.struct(p)()
@@ -134,9 +140,12 @@ class ImplicitStepper:
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         carry = (self._last, self._before, self._carried, self._carried_before)
         chain.retract(model, state, self._base, i.ratio, self._last, self._now, carry)
+        inputs = [model.data, state.data, i, self._carried, self._carried_before, self._predicted]
+        wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
         if self._touches:
-            contacts.find(model, state, self._now, self._contacts)
-            contact_law.press(model, state, self._contacts, self._law)
+            chain.retract(model, state, self._now, i.one, self._predicted, self._trial)
+            contacts.find(model, self._trial_state, self._trial, self._contacts)
+            contact_law.press(model, state, self._predicted, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)
         self._right_hand_side()
@@ -149,12 +158,14 @@ class ImplicitStepper:
         x = self._free_step
         if self._touches:
             x = self._step
-            self._touch(x)
+            contact_law.solve(
+                model, state, self._contacts, band, self._flow, self._free_step, self._law, x, coarse=ROUGH
+            )  # fmt: skip
         correction.correct(
             model, state, self._stiffness, band, self._contacts, self._flow, self._law,
             self._drive, x, self._defect, self._scratch,
         )  # fmt: skip
-        inputs = [model.data, state.data, i, band, self._carried, self._carried_before, x, s.chart]
+        inputs = [model.data, state.data, i, band, self._carried, self._predicted, x, s.chart]
         wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
         inputs = [model.data, state.data, i, self._carried, x, self._total]
         wp.launch(k.add_increments, model.element_count, inputs=inputs, device=device)
@@ -184,15 +195,6 @@ class ImplicitStepper:
             contacts.act(model, state, self._contacts, self._law.force)
         body.body_motion(model, state)
         mobility.node_velocities(model, state)
-
-    def _touch(self, x: Any) -> None:
-        """The step with contacts, into x: those of the extrapolated pose, then their gaps in the pose they lead to."""
-        model, state = self._system.model, self._system.state
-        contact_law.solve(
-            model, state, self._contacts, self._band, self._flow, self._free_step, self._law, x, coarse=ROUGH
-        )  # fmt: skip
-        chain.retract(model, state, self._now, self.data.one, x, self._trial)
-        contacts.measure(model, state, self._trial, self._contacts, self._most_contacts)
 
     def _measure_stability(self) -> None:
         model, state = self._system.model, self._system.state
@@ -281,7 +283,6 @@ class ImplicitStepper:
         nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
         capacity = 3 * nodes if self._touches else np.ones(len(nodes), dtype=int)
         total, cells = int(capacity.sum()), len(nodes)
-        self._most_contacts = int(capacity.max())
 
         def zeros(count: int, dtype: Any) -> wp.array:
             return wp.zeros(count, dtype=dtype, device=device)
@@ -294,10 +295,10 @@ class ImplicitStepper:
         c.body_head = zeros(model.flagellum_count, wp.int32)
         c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
         c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
-        c.normal, c.acting = zeros(total, p.vec3), zeros(elements, p.vec3)
+        c.normal = zeros(total, p.vec3)
 
         law = compliance.struct(p)()
-        for name in ("free_gap", "solved_gap", "residual", "force", "load", "change", "yielding", "root"):
+        for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
             setattr(law, name, zeros(total, p.real))
         law.basis = zeros((contact_law.DIRECTIONS + 1) * total, p.real)
         law.moved = zeros(contact_law.DIRECTIONS * total, p.real)
