@@ -306,7 +306,7 @@ def test_a_load_is_answered_as_by_dense_matrices(name, device, precision):
 
 def test_a_load_is_answered_where_contacts_are_few(device, precision):
     """Nodes that only the segment after them loads, and nodes without any load."""
-    b = touching({"body.contact": False}, precision, device, seed=0, separation=0.055)
+    b = touching({"body.contact": False}, precision, device, seed=0, separation=0.061)
     l = listed(b)
     loaded = {e for pair in contact_list(b) for e in pair}
     free = np.setdiff1d(np.arange(b.count), b.first)

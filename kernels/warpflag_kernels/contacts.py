@@ -16,7 +16,7 @@ import warp as wp
 from warpflag_kernels import chain, neighbours, steric
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-MARGIN = 0.15  # beyond the cutoff, in units of sigma
+MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
 
 
 @functools.cache

@@ -13,7 +13,7 @@ import warp as wp
 
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-CONTACT_REACH = 1.35  # of contacts, the cutoff and what a step's search adds [sigma]
+CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
 SKIN = 0.1  # [um]
 SLOTS = 64  # segments that a list holds
 

@@ -276,12 +276,12 @@ class ImplicitStepper:
         return sums
 
     def _contact_arrays(self) -> tuple[Any, Any]:
-        """Contacts and their law: room for three per node of a cell (eight bundled flagella need two)."""
+        """Contacts and their law: room for four per node of a cell (eight bundled flagella need three)."""
         model = self._system.model
         p, device, elements = model.precision, model.device, model.element_count
         first_node = model.data.first_node.numpy()
         nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
-        capacity = 3 * nodes if self._touches else np.ones(len(nodes), dtype=int)
+        capacity = 4 * nodes if self._touches else np.ones(len(nodes), dtype=int)
         total, cells = int(capacity.sum()), len(nodes)
 
         def zeros(count: int, dtype: Any) -> wp.array:
