@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels import mobility
+from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import cell
 from warpflag.simulation import Simulation
@@ -44,18 +44,18 @@ def kernels_in_source() -> set[tuple[str, str]]:
 
 
 def launched(
-    monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any], halves: bool = False
+    monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any], by_cells: bool = False
 ) -> set[Any]:
     """Kernels that a run of this kind launches, without compiling or running one.
 
-    halves: with the pair sum as a CPU takes it.
+    by_cells: cut as for a CPU.
     """
     kernels = set()
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
-        if not halves:
-            patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        if not by_cells:
+            patch.setattr(DeviceModel, "one_thread_per_cell", False)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:
@@ -80,7 +80,7 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole |= launched(monkeypatch, precision, "implicit", CROWD)
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     once = without_precision()
-    on_cpu = launched(monkeypatch, precision, "rkc", {}, halves=True)
+    on_cpu = set().union(*(launched(monkeypatch, precision, s, {}, by_cells=True) for s in ("rkc", "implicit")))
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from warpflag_kernels import mobility
+from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
 from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
@@ -227,7 +228,7 @@ def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypa
     scenes, forces = ragged(mode, precision), np.random.default_rng(12).uniform(-1, 1, (200, 3))
     by_halves, halves = velocities(scenes, device, forces)
     with monkeypatch.context() as patch:
-        patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        patch.setattr(DeviceModel, "one_thread_per_cell", False)
         gathered, other = velocities(scenes, device, forces)
     assert halves and not other
     # To round-off of the type.

@@ -19,22 +19,15 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+def functions(p: Precision) -> SimpleNamespace:
+    """Device function: the energy gradients of one joint."""
+    real = p.real
     Model, State = structs(p).Model, structs(p).State
-    twist_angle, joint_strain = frames.functions(p).twist_angle, frames.functions(p).joint_strain
+    twist_angle = frames.functions(p).twist_angle
 
-    @wp.kernel(module=p.module("elastic"))
-    def joint_gradients(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-    ):
-        e = wp.tid()
-        k = model.flagellum_of[e]
-        if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
-            return  # the last segment has no joint after it: its entries stay zero
+    @wp.func(module=p.module("elastic_functions"))
+    def joint(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Joint e of flagellum k: after each of its segments but the last."""
         per_length = real(1.0) / model.segment_length[k]
         t = state.tangent[e]
         u = state.tangent[e + 1]
@@ -66,6 +59,28 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state.joint_after[e] = (common - wp.cross(t, lever)) / state.length[e + 1]
         state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3
         state.joint_spin_after[e] = real(0.5) * (m1 * wp.dot(kb, b2) - m2 * wp.dot(kb, b1)) + m3
+
+    return SimpleNamespace(joint=joint)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    joint, joint_strain = functions(p).joint, frames.functions(p).joint_strain
+
+    @wp.kernel(module=p.module("elastic"))
+    def joint_gradients(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+    ):
+        e = wp.tid()
+        k = model.flagellum_of[e]
+        if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
+            return  # the last segment has no joint after it: its entries stay zero
+        joint(model, state, e, k)
 
     @wp.kernel(module=p.module("elastic_energy"))
     def energy(

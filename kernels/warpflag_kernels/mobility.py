@@ -42,7 +42,8 @@ def pair_coefficients(p: Precision):
 
 # One row of the sum by halves: pairs (i, j) for j in [begin, end), counted at both nodes. A loop that adds to what it
 # reads is vectorised only if the compiler is told that no two rows overlap, which takes C++; the body is that of
-# `gather_pairs`.
+# `gather_pairs`. Whole vectors first, then what is left in one masked vector: rows are short, one by one it would cost
+# as much as the rest.
 _ROW = """
     using R = REAL;
     const R* __restrict__ X = s.x.data; const R* __restrict__ Y = s.y.data; const R* __restrict__ Z = s.z.data;
@@ -51,10 +52,7 @@ _ROW = """
     const R a2 = a * a, near = 4 * a2, contact = R(4) / (R(3) * a), slope = R(0.375) / a2, slope_d = R(0.125) / a2;
     const R xi = X[i], yi = Y[i], zi = Z[i], fi = F[i], gi = G[i], hi = H[i];
     R ui = 0, vi = 0, wi = 0;
-    #ifndef __CUDACC__
-    #pragma clang loop vectorize(assume_safety)
-    #endif
-    for (int j = begin; j < end; ++j) {
+    const auto add_pair = [&](int j) {
         const R dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
         const R r2 = dx * dx + dy * dy + dz * dz;
         const R inv_r = R(1) / wp::sqrt(r2 > R(0) ? r2 : R(1));
@@ -65,16 +63,26 @@ _ROW = """
         const R dj = cd * (dx * F[j] + dy * G[j] + dz * H[j]), di = cd * (dx * fi + dy * gi + dz * hi);
         ui += ci * F[j] + dj * dx; vi += ci * G[j] + dj * dy; wi += ci * H[j] + dj * dz;
         U[j] += ci * fi + di * dx; V[j] += ci * gi + di * dy; W[j] += ci * hi + di * dz;
-    }
+    };
+    const int lanes = 64 / static_cast<int>(sizeof(R)), whole = end - (end - begin) % lanes;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety) interleave(disable)
+    #endif
+    for (int j = begin; j < whole; ++j) add_pair(j);
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety) vectorize_predicate(enable) interleave(disable)
+    #endif
+    for (int j = whole; j < end; ++j) add_pair(j);
     U[i] += ui; V[i] += vi; W[i] += wi;
 """
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    """Device functions: a node laid out for the pair sum, the pair sum of a cell by halves, the velocity of a node."""
     real, vec3 = p.real, p.vec3
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
-    module = p.module("mobility", pairs + ("_halves" if halves else ""))
+    module = p.module("mobility_functions", _variant(pairs, halves))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
 
     @wp.func(module=module)
@@ -90,32 +98,12 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         s.fy[e] = force[1]
         s.fz[e] = force[2]
 
-    @wp.kernel(module=module)
-    def pack(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        pack_node(model, state, s, wp.tid())
-
     @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
 
-    @wp.kernel(module=module)
-    def add_rows(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
+    @wp.func(module=module)
+    def add_rows(model: Model, state: State, s: PairSum, c: wp.int32):
+        """Pair sum of cell c, every pair once for both nodes."""
         begin = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
         i = begin
@@ -178,19 +166,9 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             j += 1
         return vec3(ux, uy, uz)
 
-    @wp.kernel(module=module)
-    def velocities(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        s: PairSum,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
+    @wp.func(module=module)
+    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32):
+        """Velocity of node e of flagellum k of cell c."""
         begin = model.first_node[k]
         end = model.first_node[k + 1]
         if e == begin:
@@ -223,12 +201,63 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             v += model.pair_mobility[c] * pair
         state.velocity[e] = v
 
-    return SimpleNamespace(pack=pack, add_rows=add_rows, velocities=velocities)
+    return SimpleNamespace(pack_node=pack_node, add_rows=add_rows, move_node=move_node)
+
+
+@functools.cache
+def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
+    f = functions(p, pairs, halves)
+    pack_node, add_rows, move_node = f.pack_node, f.add_rows, f.move_node
+    module = p.module("mobility", _variant(pairs, halves))
+
+    @wp.kernel(module=module)
+    def pack(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        pack_node(model, state, s, wp.tid())
+
+    @wp.kernel(module=module)
+    def add_pairs(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        c = wp.tid()
+        if state.active[c] != 0:
+            add_rows(model, state, s, c)
+
+    @wp.kernel(module=module)
+    def velocities(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        s: PairSum,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0:
+            move_node(model, state, s, e, model.flagellum_of[e], c)
+
+    return SimpleNamespace(pack=pack, add_pairs=add_pairs, velocities=velocities)
+
+
+def _variant(pairs: str, halves: bool) -> str:
+    return pairs + ("_halves" if halves else "")
 
 
 def sums_by_halves(model: DeviceModel) -> bool:
     """Whether the pair sum visits every pair once for both nodes: where one thread does a whole cell, it pays."""
-    return model.device.is_cpu and model.switches.pairs != "none" and not model.precision.strict
+    return model.one_thread_per_cell and model.switches.pairs != "none"
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
@@ -237,7 +266,7 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     kernels, device = _kernels(model.precision, model.switches.pairs, halves), model.device
     inputs = [model.data, state.data, state.pairs]
     if halves:
-        wp.launch(kernels.add_rows, model.cell_count, inputs=inputs, device=device)
+        wp.launch(kernels.add_pairs, model.cell_count, inputs=inputs, device=device)
     elif model.switches.pairs != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)

@@ -93,7 +93,8 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def gathers(p: Precision) -> SimpleNamespace:
+    """Device functions: all forces on one segment from others, and the force of the body on one node."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Neighbours = structs(p).Neighbours
@@ -101,7 +102,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     cutoff = real(CUTOFF)
 
-    @wp.func(module=p.module("steric"))
+    @wp.func(module=p.module("steric_functions"))
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
         """Forces on the first and second node of segment e from segments of other flagella, and the sum of |F|."""
         strength = model.steric_strength[model.cell_of[e]]
@@ -146,6 +147,32 @@ def _kernels(p: Precision) -> SimpleNamespace:
                         second += (s * magnitude) * normal
         return first, second, total
 
+    @wp.func(module=p.module("steric_functions"))
+    def body_force(model: Model, state: State, e: wp.int32, c: wp.int32):
+        """Force of the body of cell c on node e [pN]."""
+        axis = state.body_axis[c]
+        y = state.position[e]
+        along = wp.clamp(wp.dot(y, axis), -model.body_half_length[c], model.body_half_length[c])
+        away = y - along * axis
+        square = wp.dot(away, away)
+        reach = model.body_radius[c] + cutoff * model.steric_diameter[c]
+        force = vec3(real(0.0))
+        if square < reach * reach:  # few nodes are that near: only they pay for the root
+            distance = wp.sqrt(square)
+            gap = distance - model.body_radius[c]
+            magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
+            force = (magnitude / distance) * away
+        return force
+
+    return SimpleNamespace(pairs_of=pairs_of, body_force=body_force)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real = p.real
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    pairs_of, body_force = gathers(p).pairs_of, gathers(p).body_force
+
     @wp.kernel(module=p.module("steric"))
     def segments(
         # Model:
@@ -188,19 +215,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[e]
         if e == model.first_node[model.flagellum_of[e]] or state.active[c] == 0:
             return
-        axis = state.body_axis[c]
-        y = state.position[e]
-        along = wp.clamp(wp.dot(y, axis), -model.body_half_length[c], model.body_half_length[c])
-        away = y - along * axis
-        square = wp.dot(away, away)
-        reach = model.body_radius[c] + cutoff * model.steric_diameter[c]
-        force = vec3(real(0.0))
-        if square < reach * reach:  # few nodes are that near: only they pay for the root
-            distance = wp.sqrt(square)
-            gap = distance - model.body_radius[c]
-            magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
-            force = (magnitude / distance) * away
-        state.body_contact[e] = force
+        state.body_contact[e] = body_force(model, state, e, c)
 
     return SimpleNamespace(segments=segments, magnitudes=magnitudes, body=body)
 

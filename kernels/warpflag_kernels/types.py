@@ -201,6 +201,11 @@ class DeviceModel:
     element_count: int
     data: Any
 
+    @property
+    def one_thread_per_cell(self) -> bool:
+        """Whether a launch is cut by cells: on a CPU, where its threads take turns. The strict build is cut finer."""
+        return self.device.is_cpu and not self.precision.strict
+
 
 @dataclass(frozen=True)
 class DeviceState:
