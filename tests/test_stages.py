@@ -129,6 +129,7 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     assert loaded == {
         "control",
         "rkc.float64.fast",
+        "placing.float64.fast",
         "chart.float64.fast",
         "whole_cell.float64.fast.none_bearing",
         "elastic_energy.float64.fast",

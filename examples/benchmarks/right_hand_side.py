@@ -28,7 +28,7 @@ import warp as wp
 from cells import moving_nodes, placed, shape, spread
 from harness import Contender, Repeated, interleaved, table
 from native import NativePairSum, compiler
-from warpflag_kernels import chart
+from warpflag_kernels import chart, placing
 
 from warpflag.drag import pair_radius
 from warpflag.geometry import InitialState
@@ -95,7 +95,7 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
     sim = placed(scene, start)
     model, state = sim.system.model, sim.system.state
     anything = wp.zeros(1, dtype=wp.int32, device="cpu")
-    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: chart.place(model, state, sim.system.chart)}
+    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: placing.place(model, state, sim.system.chart)}
     for stage in right_hand_side(model.switches):
         launches[stage.name] = lambda stage=stage: stage.launch(model, state)
     launches[RATES] = lambda: chart.increment_rates(model, state, sim.system.chart)
