@@ -10,9 +10,11 @@ on. A pass that ends a step looks at the guards, judges the error and commits th
 right-hand side and what it takes to be part of a step.
 
 Each row is replayed alone, many times over in a captured loop, at the start of the scene and amid its contacts (5.5 ms
-later). It holds its own launches, one of which costs what the row "a launch" says. The pass is timed as the loop does
-it: a stretch of a run, over the right-hand sides in it; "stepper" is what remains of it when the rows above are taken
-off. C++ is the plain all-pairs sum over the same moving nodes, see pair_sum.py.
+later). The pass is timed as the loop does it: a stretch of a run, over the right-hand sides in it; "stepper" is what
+remains of it when the rows above are taken off. A CPU takes the right-hand side of a cell in one launch; the stages
+below are those of a GPU, each with its own launches, and "saved" is what they take together beyond that. One launch
+costs what the row "a launch" says and, besides, a look at its arguments by every thread. C++ is the plain all-pairs
+sum over the same moving nodes, see pair_sum.py.
 
 The second table has the whole right-hand side of larger cells: eight flagella, and 100 flagella of 51 nodes each.
 """
@@ -109,19 +111,21 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
 
 
 def stage_table(at_start: dict[str, float], in_contact: dict[str, float]) -> str:
-    """Stages, what they make together, and what one launch costs; shares are of the pass."""
-    parts = [name for name in at_start if name not in (WHOLE, PASS, CPP, LAUNCH)]
+    """Parts of a pass and their shares of it, the stages of the right-hand side by themselves, and C++."""
+    parts = (PLACING, WHOLE, RATES)
+    stages = [name for name in at_start if name not in (*parts, PASS, CPP, LAUNCH)]
     rows = []
-    for name in [*parts, "stepper", PASS, WHOLE, LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
+    for name in [*parts, "stepper", PASS, *stages, "saved", LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
         row: list[Any] = [name]
         for times in (at_start, in_contact):
             rest = times[PASS] - sum(times[part] for part in parts)
-            values = {**times, "stepper": rest}
+            saved = sum(times[stage] for stage in stages) - times[WHOLE]
+            values = {**times, "stepper": rest, "saved": saved}
             if name.endswith("/ C++"):
                 row += [times[name.removesuffix(" / C++")] / times[CPP] if CPP in times else None, None]
                 continue
             value = values.get(name)
-            share = f"{100 * value / times[PASS]:.0f} %" if name in (*parts, "stepper", PASS, WHOLE) else None
+            share = f"{100 * value / times[PASS]:.0f} %" if name in (*parts, "stepper", PASS) else None
             row += [None if value is None else 1e6 * value, share]
         rows.append(row)
     return table(["stage", "us at the start", "share", "us in contact", "share"], rows)
