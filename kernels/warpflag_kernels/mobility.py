@@ -223,19 +223,6 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         pack_node(model, state, s, wp.tid())
 
     @wp.kernel(module=module)
-    def add_pairs(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        c = wp.tid()
-        if state.active[c] != 0:
-            add_rows(model, state, s, c)
-
-    @wp.kernel(module=module)
     def velocities(
         # Model:
         model: Model,
@@ -248,7 +235,24 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         if state.active[c] != 0:
             move_node(model, state, s, e, model.flagellum_of[e], c)
 
-    return SimpleNamespace(pack=pack, add_pairs=add_pairs, velocities=velocities)
+    kernels = SimpleNamespace(pack=pack, velocities=velocities)
+    if halves:  # elsewhere it need not be compiled
+
+        @wp.kernel(module=module)
+        def add_pairs(
+            # Model:
+            model: Model,
+            # State:
+            state: State,
+            # Out:
+            s: PairSum,
+        ):
+            c = wp.tid()
+            if state.active[c] != 0:
+                add_rows(model, state, s, c)
+
+        kernels.add_pairs = add_pairs
+    return kernels
 
 
 def _variant(pairs: str, halves: bool) -> str:

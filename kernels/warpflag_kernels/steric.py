@@ -94,15 +94,31 @@ def functions(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def gathers(p: Precision) -> SimpleNamespace:
-    """Device functions: all forces on one segment from others, and the force of the body on one node."""
+    """Device functions: forces on one segment from others, on all of a cell, and of the body on one node."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Neighbours = structs(p).Neighbours
     steric_force, closest_parameters = functions(p).steric_force, functions(p).closest_parameters
     candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     cutoff = real(CUTOFF)
+    module = p.module("steric_functions")
 
-    @wp.func(module=p.module("steric_functions"))
+    @wp.func(module=module)
+    def contact(p1: vec3, q1: vec3, p2: vec3, q2: vec3, strength: real, diameter: real):
+        """Of segments p1 q1 and p2 q2: parameters of their closest points, force [pN], its direction on the first."""
+        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
+        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+        r = wp.length(gap)
+        magnitude = steric_force(r, strength, diameter)
+        normal = vec3(real(0.0))
+        if magnitude > real(0.0):
+            # Centre lines that touch exactly have no direction of their own: part them across both.
+            normal = gap / r
+            if r <= real(1.0e-3) * diameter:
+                normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
+        return st[0], st[1], magnitude, normal
+
+    @wp.func(module=module)
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
         """Forces on the first and second node of segment e from segments of other flagella, and the sum of |F|."""
         strength = model.steric_strength[model.cell_of[e]]
@@ -126,28 +142,57 @@ def gathers(p: Precision) -> SimpleNamespace:
                 within = reach + real(0.5) * state.length[j]
                 if wp.dot(away, away) < within * within:
                     s = real(0.0)
-                    gap = vec3(real(0.0))
+                    magnitude = real(0.0)
+                    normal = vec3(real(0.0))
                     if e < j:
-                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-                        s = st[0]
-                        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+                        s, _t, magnitude, normal = contact(p1, q1, p2, q2, strength, diameter)
                     else:
-                        st = closest_parameters(p2, q2 - p2, p1, q1 - p1)
-                        s = st[1]
-                        gap = p1 + st[1] * (q1 - p1) - (p2 + st[0] * (q2 - p2))
-                    r = wp.length(gap)
-                    magnitude = steric_force(r, strength, diameter)
+                        _s, s, magnitude, opposite = contact(p2, q2, p1, q1, strength, diameter)
+                        normal = -opposite
                     if magnitude > real(0.0):
                         total += magnitude
-                        # Centre lines that touch exactly have no direction of their own: part them across both.
-                        normal = gap / r
-                        if r <= real(1.0e-3) * diameter:
-                            normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
                         first += ((real(1.0) - s) * magnitude) * normal
                         second += (s * magnitude) * normal
         return first, second, total
 
-    @wp.func(module=p.module("steric_functions"))
+    @wp.func(module=module)
+    def pairs_of_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
+        """The same forces on all segments of cell c, every pair once for both."""
+        strength = model.steric_strength[c]
+        diameter = model.steric_diameter[c]
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        e = begin
+        while e < end:
+            state.steric_first[e] = vec3(real(0.0))
+            state.steric_second[e] = vec3(real(0.0))
+            e += 1
+        e = begin + 1
+        while e < end:
+            p1 = state.position[e - 1]
+            q1 = state.position[e]
+            middle = real(0.5) * (p1 + q1)
+            reach = real(0.5) * state.length[e] + cutoff * diameter
+            n = candidates(model, near, e)
+            i = int(0)
+            while i < n:
+                j = candidate(model, near, e, i)
+                i += 1
+                if j > e:
+                    p2 = state.position[j - 1]
+                    q2 = state.position[j]
+                    away = middle - real(0.5) * (p2 + q2)
+                    within = reach + real(0.5) * state.length[j]
+                    if wp.dot(away, away) < within * within:
+                        s, t, magnitude, normal = contact(p1, q1, p2, q2, strength, diameter)
+                        if magnitude > real(0.0):
+                            state.steric_first[e] += ((real(1.0) - s) * magnitude) * normal
+                            state.steric_second[e] += (s * magnitude) * normal
+                            state.steric_first[j] -= ((real(1.0) - t) * magnitude) * normal
+                            state.steric_second[j] -= (t * magnitude) * normal
+            e += 1
+
+    @wp.func(module=module)
     def body_force(model: Model, state: State, e: wp.int32, c: wp.int32):
         """Force of the body of cell c on node e [pN]."""
         axis = state.body_axis[c]
@@ -164,7 +209,7 @@ def gathers(p: Precision) -> SimpleNamespace:
             force = (magnitude / distance) * away
         return force
 
-    return SimpleNamespace(pairs_of=pairs_of, body_force=body_force)
+    return SimpleNamespace(pairs_of=pairs_of, pairs_of_cell=pairs_of_cell, body_force=body_force)
 
 
 @functools.cache

@@ -19,7 +19,7 @@ def _kernel(p: Precision, switches: Switches):
     with_steric, with_body, pairs = switches.steric, switches.body_contact, switches.pairs
     halves = pairs != "none"
     joint, refresh_cell = elastic.functions(p).joint, neighbours.lists(p).refresh_cell
-    pairs_of, body_force = steric.gathers(p).pairs_of, steric.gathers(p).body_force
+    pairs_of_cell, body_force = steric.gathers(p).pairs_of_cell, steric.gathers(p).body_force
     gather = forces.functions(p, with_steric, with_body).gather
     motion = body.functions(p, with_body, switches.bearing_torque)
     sum_flagellum, move = motion.sum_flagellum, motion.move
@@ -40,6 +40,7 @@ def _kernel(p: Precision, switches: Switches):
             return
         if wp.static(with_steric):
             refresh_cell(model, state, near, c)
+            pairs_of_cell(model, state, near, c)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             begin = model.first_node[k]
@@ -48,13 +49,6 @@ def _kernel(p: Precision, switches: Switches):
             while e + 1 < end:
                 joint(model, state, e, k)
                 e += 1
-            if wp.static(with_steric):
-                e = begin + 1
-                while e < end:
-                    first, second, _total = pairs_of(model, state, near, e)
-                    state.steric_first[e] = first
-                    state.steric_second[e] = second
-                    e += 1
             if wp.static(with_body):
                 e = begin + 1
                 while e < end:
