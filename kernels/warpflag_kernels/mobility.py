@@ -40,6 +40,23 @@ def pair_coefficients(p: Precision):
     return rotne_prager
 
 
+# Nodes [begin, end) laid out for the sum by halves, which begins at zero. That the components of a vector lie side by
+# side is what a compiler needs to know to move them by vectors: with strides of its arrays this takes four times as
+# long.
+_PACK = """
+    using R = REAL;
+    const R* __restrict__ P = reinterpret_cast<const R*>(position.data);
+    const R* __restrict__ Q = reinterpret_cast<const R*>(force.data);
+    R* __restrict__ X = s.x.data; R* __restrict__ Y = s.y.data; R* __restrict__ Z = s.z.data;
+    R* __restrict__ F = s.fx.data; R* __restrict__ G = s.fy.data; R* __restrict__ H = s.fz.data;
+    R* __restrict__ U = s.ux.data; R* __restrict__ V = s.uy.data; R* __restrict__ W = s.uz.data;
+    for (int i = begin; i < end; ++i) {
+        X[i] = P[3 * i]; Y[i] = P[3 * i + 1]; Z[i] = P[3 * i + 2];
+        F[i] = Q[3 * i]; G[i] = Q[3 * i + 1]; H[i] = Q[3 * i + 2];
+        U[i] = 0; V[i] = 0; W[i] = 0;
+    }
+"""
+
 # One row of the sum by halves: pairs (i, j) for j in [begin, end), counted at both nodes. A loop that adds to what it
 # reads is vectorised only if the compiler is told that no two rows overlap, which takes C++; the body is that of
 # `gather_pairs`. Whole vectors first, then what is left in one masked vector: rows are short, one by one it would cost
@@ -79,26 +96,21 @@ _ROW = """
 
 @functools.cache
 def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
-    """Device functions: a node laid out for the pair sum, the pair sum of a cell by halves, the velocity of a node."""
+    """Device functions: the pair sum of a cell by halves, and the velocity of one node."""
     real, vec3 = p.real, p.vec3
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
     module = p.module("mobility_functions", _variant(pairs, halves))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
 
-    @wp.func(module=module)
-    def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
-        x = state.position[e]
-        force = state.force[e]
-        if e == model.first_node[model.flagellum_of[e]]:
-            force = vec3(real(0.0))
-        s.x[e] = x[0]
-        s.y[e] = x[1]
-        s.z[e] = x[2]
-        s.fx[e] = force[0]
-        s.fy[e] = force[1]
-        s.fz[e] = force[2]
+    def in_cpp(source: str) -> str:
+        return source.replace("REAL", {"float64": "double", "float32": "float"}[p.name])
 
-    @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
+    @wp.func_native(in_cpp(_PACK))
+    def pack_cell(
+        position: wp.array(dtype=vec3), force: wp.array(dtype=vec3), s: PairSum, begin: wp.int32, end: wp.int32
+    ): ...
+
+    @wp.func_native(in_cpp(_ROW))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
 
     @wp.func(module=module)
@@ -106,13 +118,14 @@ def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         """Pair sum of cell c, every pair once for both nodes."""
         begin = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
-        i = begin
-        while i < end:
-            pack_node(model, state, s, i)
-            s.ux[i] = real(0.0)
-            s.uy[i] = real(0.0)
-            s.uz[i] = real(0.0)
-            i += 1
+        pack_cell(state.position, state.force, s, begin, end)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            i = model.first_node[k]
+            s.fx[i] = real(0.0)
+            s.fy[i] = real(0.0)
+            s.fz[i] = real(0.0)
+            k += 1
         i = begin
         while i < end:
             own = model.first_node[model.flagellum_of[i]]
@@ -201,14 +214,14 @@ def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             v += model.pair_mobility[c] * pair
         state.velocity[e] = v
 
-    return SimpleNamespace(pack_node=pack_node, add_rows=add_rows, move_node=move_node)
+    return SimpleNamespace(add_rows=add_rows, move_node=move_node)
 
 
 @functools.cache
 def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
-    f = functions(p, pairs, halves)
-    pack_node, add_rows, move_node = f.pack_node, f.add_rows, f.move_node
+    add_rows, move_node = functions(p, pairs, halves).add_rows, functions(p, pairs, halves).move_node
     module = p.module("mobility", _variant(pairs, halves))
 
     @wp.kernel(module=module)
@@ -220,7 +233,17 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
         # Out:
         s: PairSum,
     ):
-        pack_node(model, state, s, wp.tid())
+        e = wp.tid()
+        x = state.position[e]
+        force = state.force[e]
+        if e == model.first_node[model.flagellum_of[e]]:
+            force = vec3(real(0.0))
+        s.x[e] = x[0]
+        s.y[e] = x[1]
+        s.z[e] = x[2]
+        s.fx[e] = force[0]
+        s.fy[e] = force[1]
+        s.fz[e] = force[2]
 
     @wp.kernel(module=module)
     def velocities(
