@@ -41,8 +41,8 @@ def pair_coefficients(p: Precision):
 
 
 # Nodes [begin, end) laid out for the sum by halves, which begins at zero. That the components of a vector lie side by
-# side is what a compiler needs to know to move them by vectors: with strides of its arrays this takes four times as
-# long.
+# side is what a compiler needs to know to move many at once; in Warp, with a stride from the array, this takes
+# several times as long.
 _PACK = """
     using R = REAL;
     const R* __restrict__ P = reinterpret_cast<const R*>(position.data);
@@ -96,7 +96,7 @@ _ROW = """
 
 @functools.cache
 def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
-    """Device functions: the pair sum of a cell by halves, and the velocity of one node."""
+    """Device functions: velocities of one node, and of all nodes of a cell."""
     real, vec3 = p.real, p.vec3
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
     module = p.module("mobility_functions", _variant(pairs, halves))
@@ -214,14 +214,25 @@ def functions(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
             v += model.pair_mobility[c] * pair
         state.velocity[e] = v
 
-    return SimpleNamespace(add_rows=add_rows, move_node=move_node)
+    @wp.func(module=module)
+    def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
+        """Velocities of all nodes of cell c."""
+        if wp.static(halves):
+            add_rows(model, state, s, c)
+        e = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        while e < end:
+            move_node(model, state, s, e, model.flagellum_of[e], c)
+            e += 1
+
+    return SimpleNamespace(move_node=move_node, move_cell=move_cell)
 
 
 @functools.cache
 def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(p).PairSum
-    add_rows, move_node = functions(p, pairs, halves).add_rows, functions(p, pairs, halves).move_node
+    move_node, move_cell = functions(p, pairs, halves).move_node, functions(p, pairs, halves).move_cell
     module = p.module("mobility", _variant(pairs, halves))
 
     @wp.kernel(module=module)
@@ -262,19 +273,18 @@ def _kernels(p: Precision, pairs: str, halves: bool) -> SimpleNamespace:
     if halves:  # elsewhere it need not be compiled
 
         @wp.kernel(module=module)
-        def add_pairs(
+        def by_cells(
             # Model:
             model: Model,
             # State:
             state: State,
-            # Out:
             s: PairSum,
         ):
             c = wp.tid()
             if state.active[c] != 0:
-                add_rows(model, state, s, c)
+                move_cell(model, state, s, c)
 
-        kernels.add_pairs = add_pairs
+        kernels.by_cells = by_cells
     return kernels
 
 
@@ -293,7 +303,8 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     kernels, device = _kernels(model.precision, model.switches.pairs, halves), model.device
     inputs = [model.data, state.data, state.pairs]
     if halves:
-        wp.launch(kernels.add_pairs, model.cell_count, inputs=inputs, device=device)
-    elif model.switches.pairs != "none":
+        wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)
+        return
+    if model.switches.pairs != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)

@@ -17,13 +17,12 @@ def _kernel(p: Precision, switches: Switches):
     Model, State = structs(p).Model, structs(p).State
     PairSum, Neighbours = structs(p).PairSum, structs(p).Neighbours
     with_steric, with_body, pairs = switches.steric, switches.body_contact, switches.pairs
-    halves = pairs != "none"
     joint, refresh_cell = elastic.functions(p).joint, neighbours.lists(p).refresh_cell
     pairs_of_cell, body_force = steric.gathers(p).pairs_of_cell, steric.gathers(p).body_force
     gather = forces.functions(p, with_steric, with_body).gather
     motion = body.functions(p, with_body, switches.bearing_torque)
     sum_flagellum, move = motion.sum_flagellum, motion.move
-    add_rows, move_node = mobility.functions(p, pairs, halves).add_rows, mobility.functions(p, pairs, halves).move_node
+    move_cell = mobility.functions(p, pairs, halves=pairs != "none").move_cell
     words = {pairs: True, "steric": with_steric, "body": with_body, "bearing": switches.bearing_torque}
 
     @wp.kernel(module=p.module("whole_cell", "_".join(word for word, on in words.items() if on)))
@@ -61,13 +60,7 @@ def _kernel(p: Precision, switches: Switches):
             sum_flagellum(model, state, k)
             k += 1
         move(model, state, c)
-        if wp.static(halves):
-            add_rows(model, state, s, c)
-        e = model.first_node[model.first_flagellum[c]]
-        end = model.first_node[model.first_flagellum[c + 1]]
-        while e < end:
-            move_node(model, state, s, e, model.flagellum_of[e], c)
-            e += 1
+        move_cell(model, state, s, c)
 
     return right_hand_side
 
