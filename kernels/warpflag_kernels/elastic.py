@@ -23,7 +23,7 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device function: the energy gradients of one joint."""
     real = p.real
     Model, State = structs(p).Model, structs(p).State
-    twist_angle = frames.functions(p).twist_angle
+    twist, angle = frames.functions(p).twist, frames.functions(p).angle
 
     @wp.func(module=p.module("elastic_functions"))
     def joint(model: Model, state: State, e: wp.int32, k: wp.int32):
@@ -35,9 +35,10 @@ def functions(p: Precision) -> SimpleNamespace:
         b1 = state.director[e + 1]
         per_chi = real(1.0) / (real(1.0) + wp.dot(t, u))
         kb = wp.cross(t, u) * (real(2.0) * per_chi)
-        twist = twist_angle(t, u, a1, b1)
+        sine, cosine = twist(t, u, a1, b1)
+        turned = angle(sine, cosine)
         if e == model.first_node[k]:
-            moment = model.hook_rigidity[k] * per_length * twist
+            moment = model.hook_rigidity[k] * per_length * turned
             gradient = (real(0.5) * moment) * kb
             state.joint_before[e] = gradient
             state.joint_after[e] = gradient / state.length[e + 1]
@@ -52,7 +53,7 @@ def functions(p: Precision) -> SimpleNamespace:
         stiffness = model.bending_rigidity[k] * per_length
         m1 = stiffness * (w1 - rest[0])
         m2 = stiffness * (w2 - rest[1])
-        m3 = model.twist_rigidity[k] * per_length * (twist - rest[2])
+        m3 = model.twist_rigidity[k] * per_length * (turned - rest[2])
         common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
         lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
         state.joint_before[e] = (common + wp.cross(u, lever)) / state.length[e]

@@ -73,10 +73,16 @@ def functions(p: Precision) -> SimpleNamespace:
         return wp.normalize(v - wp.dot(v, t) * t)
 
     @wp.func(module=module)
-    def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
-        """Angle from a1, transported from t onto u, to b1 [rad]."""
+    def twist(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """(sine, cosine) of the angle from a1, transported from t onto u, to b1."""
         pa = transport(a1, t, u)
-        return angle(wp.dot(wp.cross(pa, b1), u), wp.dot(pa, b1))
+        return wp.dot(wp.cross(pa, b1), u), wp.dot(pa, b1)
+
+    @wp.func(module=module)
+    def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """That angle [rad]."""
+        s, c = twist(t, u, a1, b1)
+        return wp.atan2(s, c)
 
     @wp.func(module=module)
     def joint_strain(t: vec3, u: vec3, a1: vec3, b1: vec3):
@@ -102,6 +108,7 @@ def functions(p: Precision) -> SimpleNamespace:
         angle=angle,
         turn=turn,
         perpendicular_unit=perpendicular_unit,
+        twist=twist,
         twist_angle=twist_angle,
         joint_strain=joint_strain,
         rotation_vector_quat=rotation_vector_quat,
