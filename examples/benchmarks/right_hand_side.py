@@ -16,7 +16,8 @@ below are those of a GPU, each with its own launches, and "saved" is what they t
 costs what the row "a launch" says and, besides, a look at its arguments by every thread. C++ is the plain all-pairs
 sum over the same moving nodes, see pair_sum.py.
 
-The second table has the whole right-hand side of larger cells: eight flagella, and 100 flagella of 51 nodes each.
+The second table has the whole right-hand side of larger cells: eight flagella, and 100 flagella of 51 nodes each; two of
+its stages by themselves, where contact takes every pair twice.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def main() -> None:
         rows.append(whole_row("eight flagella, in contact", with_rkc(eight, precision), bundled, args.rounds))
     for precision in ("float64", "float32"):
         rows.append(whole_row("100 flagella of 51 nodes", spread(100, 50, precision), None, args.rounds))
-    head = ["cell", "moving nodes", "precision", "right-hand side us", "of it steric", "pair sum", "C++ pair sum us"]
+    head = ["cell", "moving nodes", "precision", "right-hand side us", "steric", "pair sum", "C++ pair sum us"]
     print(table([*head, "right-hand side / C++"], rows))
 
 
