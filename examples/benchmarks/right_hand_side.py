@@ -16,8 +16,8 @@ below are those of a GPU, each with its own launches, and "saved" is what they t
 costs what the row "a launch" says and, besides, a look at its arguments by every thread. C++ is the plain all-pairs
 sum over the same moving nodes, see pair_sum.py.
 
-The second table has the whole right-hand side of larger cells: eight flagella, and 100 flagella of 51 nodes each; two of
-its stages by themselves, where contact takes every pair twice.
+The second table has the whole right-hand side of larger cells, eight flagella, and 100 flagella of 51 nodes each; and
+two of its stages by themselves, where contact takes every pair twice.
 """
 
 from __future__ import annotations
