@@ -105,19 +105,20 @@ def gathers(p: Precision) -> SimpleNamespace:
     module = p.module("steric_functions")
 
     @wp.func(module=module)
-    def contact(p1: vec3, q1: vec3, p2: vec3, q2: vec3, strength: real, diameter: real):
-        """Of segments p1 q1 and p2 q2: parameters of their closest points, force [pN], its direction on the first."""
+    def nearest(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
+        """Of segments p1 q1 and p2 q2: parameters of their closest points, and the way to the first from the second."""
         st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
         gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
-        r = wp.length(gap)
-        magnitude = steric_force(r, strength, diameter)
-        normal = vec3(real(0.0))
-        if magnitude > real(0.0):
-            # Centre lines that touch exactly have no direction of their own: part them across both.
-            normal = gap / r
-            if r <= real(1.0e-3) * diameter:
-                normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
-        return st[0], st[1], magnitude, normal
+        return st[0], st[1], gap
+
+    @wp.func(module=module)
+    def direction(gap: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
+        """Of the force on the first of two segments along d1 and d2, across a gap of length r."""
+        # Centre lines that touch exactly have no direction of their own: part them across both.
+        normal = gap / r
+        if r <= real(1.0e-3) * diameter:
+            normal = wp.normalize(wp.cross(d1, d2))  # changes sign with the side
+        return normal
 
     @wp.func(module=module)
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
@@ -143,15 +144,17 @@ def gathers(p: Precision) -> SimpleNamespace:
                 within = reach + real(0.5) * state.length[j]
                 if wp.dot(away, away) < within * within:
                     s = real(0.0)
-                    magnitude = real(0.0)
-                    normal = vec3(real(0.0))
+                    gap = vec3(real(0.0))
                     if e < j:
-                        s, _t, magnitude, normal = contact(p1, q1, p2, q2, strength, diameter)
+                        s, _t, gap = nearest(p1, q1, p2, q2)
                     else:
-                        _s, s, magnitude, opposite = contact(p2, q2, p1, q1, strength, diameter)
-                        normal = -opposite
+                        _s, s, back = nearest(p2, q2, p1, q1)
+                        gap = -back
+                    r = wp.length(gap)
+                    magnitude = steric_force(r, strength, diameter)
                     if magnitude > real(0.0):
                         total += magnitude
+                        normal = direction(gap, r, q1 - p1, q2 - p2, diameter)
                         first += ((real(1.0) - s) * magnitude) * normal
                         second += (s * magnitude) * normal
         return first, second, total
@@ -185,8 +188,11 @@ def gathers(p: Precision) -> SimpleNamespace:
                     away = middle - real(0.5) * (p2 + q2)
                     within = reach + real(0.5) * state.length[j]
                     if wp.dot(away, away) < within * within:
-                        s, t, magnitude, normal = contact(p1, q1, p2, q2, strength, diameter)
+                        s, t, gap = nearest(p1, q1, p2, q2)
+                        r = wp.length(gap)
+                        magnitude = steric_force(r, strength, diameter)
                         if magnitude > real(0.0):
+                            normal = direction(gap, r, q1 - p1, q2 - p2, diameter)
                             state.steric_first[e] += ((real(1.0) - s) * magnitude) * normal
                             state.steric_second[e] += (s * magnitude) * normal
                             state.steric_first[j] -= ((real(1.0) - t) * magnitude) * normal
