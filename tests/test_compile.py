@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels import banded, mobility
+from warpflag_kernels import banded
+from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import cell
 from warpflag.simulation import Simulation
@@ -45,18 +46,18 @@ def kernels_in_source() -> set[tuple[str, str]]:
 
 
 def launched(
-    monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any], halves: bool = False
+    monkeypatch: pytest.MonkeyPatch, precision: str, stepper: str, switches: dict[str, Any], by_cells: bool = False
 ) -> set[Any]:
     """Kernels that a run of this kind launches, without compiling or running one.
 
-    halves: with the pair sum and the body's columns as a CPU takes them.
+    by_cells: cut as for a CPU.
     """
     kernels = set()
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
-        if not halves:
-            patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        if not by_cells:
+            patch.setattr(DeviceModel, "one_thread_per_cell", False)
             patch.setattr(banded, "columns_apart", lambda model: True)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
@@ -82,11 +83,11 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole |= launched(monkeypatch, precision, "implicit", CROWD)
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     once = without_precision()
-    on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, halves=True) for stepper in STEPPERS))
+    on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.
-    targets = {kernel.module: [80] if precision == "float64" else [90] for kernel in reduced}
+    targets = {kernel.module: [80] if precision == "float64" else [90] for kernel in reduced | on_cpu}
     targets |= {kernel.module: [80, 90] for kernel in (whole if precision == "float64" else whole | once)}
     for module, architectures in targets.items():
         assert module.name.startswith("warpflag_kernels.")

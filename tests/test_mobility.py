@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpflag_kernels import mobility
+from warpflag_kernels import mobility, pair_sum
+from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
 from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
@@ -228,7 +229,7 @@ def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypa
     scenes, forces = ragged(mode, precision), np.random.default_rng(12).uniform(-1, 1, (200, 3))
     by_halves, halves = velocities(scenes, device, forces)
     with monkeypatch.context() as patch:
-        patch.setattr(mobility, "sums_by_halves", lambda model: False)
+        patch.setattr(DeviceModel, "one_thread_per_cell", False)
         gathered, other = velocities(scenes, device, forces)
     assert halves and not other
     # To round-off of the type.
@@ -243,7 +244,7 @@ SHORT = {"numerics.pair_precision": "float32"}
 def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device, monkeypatch):
     """Terms in float32, sums in float64: more nodes lose no more digits."""
     if form == "gathered":
-        monkeypatch.setattr(mobility, "sums_by_halves", lambda model: False)
+        monkeypatch.setattr(DeviceModel, "one_thread_per_cell", False)
     scene = cell({"hydrodynamics.mode": mode, "flagella.count": 3, "flagella.segment_length": 0.02})
     found = []
     for values, real in (({}, np.float64), (SHORT, np.float32)):
@@ -251,7 +252,7 @@ def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device,
             with_values(scene, values), device=device, starts=shaken(scene, 4, node=0.002), strict=form == "strict"
         )
         state = sim.system.state
-        assert len(state.data.position) > 2 * mobility.BLOCK
+        assert len(state.data.position) > 2 * pair_sum.BLOCK
         found.append(sim.evaluate().velocities)
         assert all(a.numpy().dtype == real for a in (state.pairs.x, state.pairs.fz))
         assert state.data.velocity.numpy().dtype == np.float64

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
+from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import cell
 from warpflag.model import switches_of
@@ -28,12 +29,17 @@ TERMS = {
 }
 
 
-def launches(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Kernels that one pass, an evaluation and a look at the state launch, in order."""
+def launches(scene: Scene, monkeypatch: pytest.MonkeyPatch, by_cells: bool = False) -> list[Any]:
+    """Kernels that one pass, an evaluation and a look at the state launch, in order.
+
+    by_cells: cut as for a CPU, else by stages.
+    """
     kernels: list[Any] = []
     sim = Simulation(scene, device="cpu")
     sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
     with monkeypatch.context() as patch:
+        if not by_cells:
+            patch.setattr(DeviceModel, "one_thread_per_cell", False)
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.append(kernel))
         sim.stepper.launch_pass()
         sim.evaluate()
@@ -64,6 +70,15 @@ def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypat
             assert (getattr(state, name) is not None) == present, name
 
 
+def test_on_a_cpu_the_right_hand_side_is_one_launch(monkeypatch):
+    scene, stages = (
+        cell({"numerics.stepper": "rkc"}),
+        {"elastic", "steric", "steric_body", "forces", "body", "mobility"},
+    )
+    assert not stages_of(launches(scene, monkeypatch, by_cells=True)) & stages
+    assert stages_of(launches(scene, monkeypatch)) >= stages
+
+
 def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
     implicit = {"numerics.stepper": "implicit"}
     solver = {"contacts", "contact_law"}
@@ -75,8 +90,8 @@ def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
 @pytest.mark.parametrize("mode", ["none", "within", "between", "all"])
 def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
     scene = cell({"hydrodynamics.mode": mode})
-    halves = "" if mode == "none" else "_halves"  # how a CPU takes the sum
-    assert variants_of(launches(scene, monkeypatch), "mobility") == {mode + halves}
+    assert variants_of(launches(scene, monkeypatch), "mobility") == {mode}
+    assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{mode}_steric_body_bearing"}
     model = Simulation(scene, device="cpu").system.model.data
     assert (model.pair_radius is None) == (mode == "none")
 
@@ -84,7 +99,7 @@ def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
 def test_a_single_flagellum_has_no_partner(monkeypatch):
     scene = cell({"flagella.count": 1})
     kernels, both = launches(scene, monkeypatch), launches(cell(), monkeypatch)
-    assert variants_of(kernels, "mobility") == {"within_halves"}
+    assert variants_of(kernels, "mobility") == {"within"}
     assert not stages_of(kernels) & {"steric", "steric_measure"}
     crossings = [[k for k in found if k.func.__name__ == "check_crossings"] for found in (kernels, both)]
     assert [len(found) for found in crossings] == [0, 1]
@@ -114,12 +129,10 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     assert loaded == {
         "control",
         "rkc.float64.fast",
+        "placing.float64.fast",
         "chart.float64.fast",
-        "elastic.float64.fast",
+        "whole_cell.float64.fast.none_bearing",
         "elastic_energy.float64.fast",
-        "forces.float64.fast",
-        "body.float64.fast._bearing",
-        "mobility.float64.fast.none",
         "guard.float64.fast",
     }
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from warpflag_kernels import chart
+from warpflag_kernels import chart, placing
 
 from tests.helpers import anchors, as_start, cell, displaced, free_nodes, shaken, touching_cell
 from warpflag.geometry import InitialState
@@ -87,7 +87,7 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
         c.body_increment.assign(body + shift * rates[1])
         c.elapsed.fill_(1e-5 + shift)
         state.data.active.fill_(1)
-        chart.place(model, state, c)
+        placing.place(model, state, c)
         return tuple(a.numpy().copy() for a in (state.data.position, state.data.director, state.data.body_position))
 
     rates = np.zeros_like(nodes), np.zeros_like(body)

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import chart as chart_stage
 from warpflag_kernels import control as control_stage
-from warpflag_kernels import elastic, guard, steric
+from warpflag_kernels import elastic, guard, placing, steric
 from warpflag_kernels.types import Precision
 
 from warpflag.cell_state import CellState, Evaluation
@@ -290,7 +289,7 @@ class Simulation:
         s.data.active.fill_(1)
         for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
             array.zero_()
-        chart_stage.place(self.system.model, s, chart)
+        placing.place(self.system.model, s, chart)
 
     def _placed_state(self) -> CellState:
         """The first cell before any step, or after a state was set from outside."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from warpflag_kernels import body, elastic, forces, mobility, steric
+from warpflag_kernels import body, elastic, forces, mobility, steric, whole_cell
 from warpflag_kernels.types import DeviceModel, DeviceState, Switches
 
 __all__ = ["Stage", "launch_right_hand_side", "right_hand_side"]
@@ -37,6 +37,9 @@ def right_hand_side(switches: Switches) -> tuple[Stage, ...]:
 
 
 def launch_right_hand_side(model: DeviceModel, state: DeviceState) -> None:
-    """Forces, torques and velocities at the current evaluation point."""
+    """Forces, torques and velocities at the current evaluation point: on a CPU in one launch, else stage by stage."""
+    if model.one_thread_per_cell:
+        whole_cell.right_hand_side(model, state)
+        return
     for stage in right_hand_side(model.switches):
         stage.launch(model, state)

@@ -32,7 +32,8 @@ import warpflag_kernels
 from cells import spread
 from cubin import Usage, usage
 from harness import table
-from warpflag_kernels import banded, mobility
+from warpflag_kernels import banded
+from warpflag_kernels.types import DeviceModel
 
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
@@ -45,17 +46,17 @@ def collected() -> Iterator[set[Any]]:
     """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
-    by_halves, apart = mobility.sums_by_halves, banded.columns_apart
+    by_cells, apart = DeviceModel.one_thread_per_cell, banded.columns_apart
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
-        mobility.sums_by_halves = lambda _model: False  # which is for a CPU
+        DeviceModel.one_thread_per_cell = False  # which is for a CPU
         banded.columns_apart = lambda _model: True
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
-        mobility.sums_by_halves, banded.columns_apart = by_halves, apart
+        DeviceModel.one_thread_per_cell, banded.columns_apart = by_cells, apart
 
 
 def launched(precision: str, stepper: str) -> set[Any]:

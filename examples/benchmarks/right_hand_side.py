@@ -10,11 +10,14 @@ on. A pass that ends a step looks at the guards, judges the error and commits th
 right-hand side and what it takes to be part of a step.
 
 Each row is replayed alone, many times over in a captured loop, at the start of the scene and amid its contacts (5.5 ms
-later). It holds its own launches, one of which costs what the row "a launch" says. The pass is timed as the loop does
-it: a stretch of a run, over the right-hand sides in it; "stepper" is what remains of it when the rows above are taken
-off. C++ is the plain all-pairs sum over the same moving nodes, see pair_sum.py.
+later). The pass is timed as the loop does it: a stretch of a run, over the right-hand sides in it; "stepper" is what
+remains of it when the rows above are taken off. A CPU takes the right-hand side of a cell in one launch; the stages
+below are those of a GPU, each with its own launches, and "saved" is what they take together beyond that. One launch
+costs what the row "a launch" says and, besides, a look at its arguments by every thread. C++ is the plain all-pairs
+sum over the same moving nodes, see pair_sum.py.
 
-The second table has the whole right-hand side of larger cells: eight flagella, and 100 flagella of 51 nodes each.
+The second table has the whole right-hand side of larger cells, eight flagella, and 100 flagella of 51 nodes each; and
+two of its stages by themselves, where contact takes every pair twice.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ import warp as wp
 from cells import moving_nodes, placed, shape, spread
 from harness import Contender, Repeated, interleaved, table
 from native import NativePairSum, compiler
-from warpflag_kernels import chart
+from warpflag_kernels import chart, placing
 
 from warpflag.drag import pair_radius
 from warpflag.geometry import InitialState
@@ -95,7 +98,7 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
     sim = placed(scene, start)
     model, state = sim.system.model, sim.system.state
     anything = wp.zeros(1, dtype=wp.int32, device="cpu")
-    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: chart.place(model, state, sim.system.chart)}
+    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: placing.place(model, state, sim.system.chart)}
     for stage in right_hand_side(model.switches):
         launches[stage.name] = lambda stage=stage: stage.launch(model, state)
     launches[RATES] = lambda: chart.increment_rates(model, state, sim.system.chart)
@@ -109,19 +112,21 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
 
 
 def stage_table(at_start: dict[str, float], in_contact: dict[str, float]) -> str:
-    """Stages, what they make together, and what one launch costs; shares are of the pass."""
-    parts = [name for name in at_start if name not in (WHOLE, PASS, CPP, LAUNCH)]
+    """Parts of a pass and their shares of it, the stages of the right-hand side by themselves, and C++."""
+    parts = (PLACING, WHOLE, RATES)
+    stages = [name for name in at_start if name not in (*parts, PASS, CPP, LAUNCH)]
     rows = []
-    for name in [*parts, "stepper", PASS, WHOLE, LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
+    for name in [*parts, "stepper", PASS, *stages, "saved", LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
         row: list[Any] = [name]
         for times in (at_start, in_contact):
             rest = times[PASS] - sum(times[part] for part in parts)
-            values = {**times, "stepper": rest}
+            saved = sum(times[stage] for stage in stages) - times[WHOLE]
+            values = {**times, "stepper": rest, "saved": saved}
             if name.endswith("/ C++"):
                 row += [times[name.removesuffix(" / C++")] / times[CPP] if CPP in times else None, None]
                 continue
             value = values.get(name)
-            share = f"{100 * value / times[PASS]:.0f} %" if name in (*parts, "stepper", PASS, WHOLE) else None
+            share = f"{100 * value / times[PASS]:.0f} %" if name in (*parts, "stepper", PASS) else None
             row += [None if value is None else 1e6 * value, share]
         rows.append(row)
     return table(["stage", "us at the start", "share", "us in contact", "share"], rows)
@@ -167,7 +172,7 @@ def main() -> None:
         rows.append(whole_row("eight flagella, in contact", with_rkc(eight, precision), bundled, args.rounds))
     for precision in ("float64", "float32"):
         rows.append(whole_row("100 flagella of 51 nodes", spread(100, 50, precision), None, args.rounds))
-    head = ["cell", "moving nodes", "precision", "right-hand side us", "of it steric", "pair sum", "C++ pair sum us"]
+    head = ["cell", "moving nodes", "precision", "right-hand side us", "steric", "pair sum", "C++ pair sum us"]
     print(table([*head, "right-hand side / C++"], rows))
 
 

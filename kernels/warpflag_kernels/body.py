@@ -14,23 +14,15 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNamespace:
+def functions(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNamespace:
+    """Device functions: what one flagellum hands to the body, and the motion of one body."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    variant = ("_contact" if body_contact else "") + ("_bearing" if bearing_torque else "")
-    module = p.module("body", variant)
+    module = p.module("body_functions", _variant(body_contact, bearing_torque))
 
-    @wp.kernel(module=module)
-    def sum_flagellum(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-    ):
-        k = wp.tid()
+    @wp.func(module=module)
+    def sum_flagellum(model: Model, state: State, k: wp.int32):
         first = model.first_node[k]
-        if state.active[model.cell_of[first]] == 0:
-            return
         m = state.tangent[first]
         force = state.force[first]
         torque = wp.cross(state.position[first], force) - model.motor_torque[k] * m
@@ -46,16 +38,8 @@ def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNa
         state.flagellum_force[k] = force
         state.flagellum_torque[k] = torque
 
-    @wp.kernel(module=module)
-    def move(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
+    @wp.func(module=module)
+    def move(model: Model, state: State, c: wp.int32):
         force = vec3(real(0.0))
         torque = vec3(real(0.0))
         k = model.first_flagellum[c]
@@ -76,11 +60,47 @@ def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNa
     return SimpleNamespace(sum_flagellum=sum_flagellum, move=move)
 
 
+@functools.cache
+def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNamespace:
+    Model, State = structs(p).Model, structs(p).State
+    f = functions(p, body_contact, bearing_torque)
+    sum_flagellum, move = f.sum_flagellum, f.move
+    module = p.module("body", _variant(body_contact, bearing_torque))
+
+    @wp.kernel(module=module)
+    def sum_flagella(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+    ):
+        k = wp.tid()
+        if state.active[model.cell_of[model.first_node[k]]] != 0:
+            sum_flagellum(model, state, k)
+
+    @wp.kernel(module=module)
+    def move_all(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+    ):
+        c = wp.tid()
+        if state.active[c] != 0:
+            move(model, state, c)
+
+    return SimpleNamespace(sum_flagella=sum_flagella, move=move_all)
+
+
+def _variant(body_contact: bool, bearing_torque: bool) -> str:
+    return ("_contact" if body_contact else "") + ("_bearing" if bearing_torque else "")
+
+
 def body_motion(model: DeviceModel, state: DeviceState) -> None:
     """Velocity [um/s] and angular velocity [rad/s] of every body, into `body_velocity` and `body_spin`."""
     kernels = _kernels(model.precision, model.switches.body_contact, model.switches.bearing_torque)
     inputs = [model.data, state.data]
-    wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=inputs, device=model.device)
+    wp.launch(kernels.sum_flagella, model.flagellum_count, inputs=inputs, device=model.device)
     move_bodies(model, state)
 
 

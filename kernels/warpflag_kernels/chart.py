@@ -50,102 +50,57 @@ def struct(p: Precision) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
-    real, vec3, vec4, mat33 = p.real, p.vec3, p.vec4, p.mat33
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions: the rate of the increment of one element, and of one body."""
+    real, vec4 = p.real, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, struct(p)
-    f, fd = frames.functions(p), frames.functions(Precision("float64", p.strict))
-    transport, transport_spin, turn, perpendicular_unit = (
-        f.transport, f.transport_spin, f.turn, f.perpendicular_unit,
-    )  # fmt: skip
-    rotation_vector_quat, rotation_vector_quatd = f.rotation_vector_quat, fd.rotation_vector_quat
-    module = p.module("chart")
+    transport_spin = frames.functions(p).transport_spin
+    module = p.module("chart_functions")
 
-    @wp.kernel(module=module)
-    def place_bodies(
-        # Model:
-        model: Model,
-        # State:
-        chart: Chart,
-        # Out:
-        state: State,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
+    @wp.func(module=module)
+    def find_rate(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, c: wp.int32):
+        first = model.first_node[k]
+        t = state.tangent[e]
+        base = chart.base_tangent[e]
+        spin = model.spin_mobility[k] * state.spin_torque[e]
+        if e == first:
+            spin -= transport_spin(base, t, wp.cross(state.body_spin[c], t))
+            chart.rate[e] = vec4(real(0.0), real(0.0), real(0.0), spin)
             return
+        back = wp.transpose(chart.flagellum_turn[k])
+        omega = chart.flagellum_spin[k]
+        offset = state.position[e] - state.position[first]
+        x_rate = back * (state.velocity[e] - state.velocity[first] - wp.cross(omega, offset))
+        relative = state.velocity[e] - state.velocity[e - 1]
+        t_rate = (relative - wp.dot(relative, t) * t) / state.length[e] - wp.cross(omega, t)
+        spin -= wp.dot(omega, t) + transport_spin(base, back * t, back * t_rate)
+        chart.rate[e] = vec4(x_rate[0], x_rate[1], x_rate[2], spin)
+
+    @wp.func(module=module)
+    def find_body_rate(state: State, chart: Chart, c: wp.int32):
         b = chart.body_increment[c]
-        turned = rotation_vector_quatd(wp.vec3d(b[3], b[4], b[5])) * chart.base_body_orientation[c]
-        orientation = wp.normalize(turned)
-        state.body_position[c] = chart.base_body_position[c] + wp.vec3d(b[0], b[1], b[2])
-        state.body_orientation[c] = orientation
-        state.body_axis[c] = vec3(wp.quat_rotate(orientation, wp.vec3d(0.0, 0.0, 1.0)))
+        w = wp.vec3d(b[3], b[4], b[5])
+        v = wp.vec3d(state.body_velocity[c])
+        omega = wp.vec3d(state.body_spin[c])
+        # Rate of the rotation vector: inverse of the exponential's differential.
+        angle = wp.length(w)
+        scale = wp.float64(1.0) / wp.float64(12.0)
+        if angle > wp.float64(1.0e-2):
+            half = wp.float64(0.5) * angle
+            scale = (wp.float64(1.0) - half * wp.cos(half) / wp.sin(half)) / (angle * angle)
+        wxo = wp.cross(w, omega)
+        w_rate = omega - wp.float64(0.5) * wxo + scale * wp.cross(w, wxo)
+        chart.body_rate[c] = vec6d(v[0], v[1], v[2], w_rate[0], w_rate[1], w_rate[2])
 
-    @wp.kernel(module=module)
-    def place_flagella(
-        # Model:
-        model: Model,
-        # State:
-        chart: Chart,
-        # Out:
-        state: State,
-    ):
-        k = wp.tid()
-        first = model.first_node[k]
-        c = model.cell_of[first]
-        if state.active[c] == 0:
-            return
-        orientation = state.body_orientation[c]
-        state.position[first] = vec3(wp.quat_rotate(orientation, wp.vec3d(model.anchor[k])))
-        state.tangent[first] = vec3(wp.quat_rotate(orientation, wp.vec3d(model.motor_axis[k])))
-        turned = rotation_vector_quat(real(chart.elapsed[c]) * chart.flagellum_spin[k])
-        chart.flagellum_turn[k] = wp.quat_to_matrix(turned)
+    return SimpleNamespace(find_rate=find_rate, find_body_rate=find_body_rate)
 
-    @wp.kernel(module=module)
-    def place_nodes(
-        # Model:
-        model: Model,
-        # State:
-        chart: Chart,
-        # Out:
-        state: State,
-    ):
-        e = wp.tid()
-        k = model.flagellum_of[e]
-        first = model.first_node[k]
-        if e == first or state.active[model.cell_of[e]] == 0:
-            return
-        x = chart.increment[e]
-        offset = chart.base_position[e] - chart.base_position[first] + vec3(x[0], x[1], x[2])
-        state.position[e] = state.position[first] + chart.flagellum_turn[k] * offset
 
-    @wp.kernel(module=module)
-    def place_frames(
-        # Model:
-        model: Model,
-        # State:
-        chart: Chart,
-        # Out:
-        state: State,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
-        first = model.first_node[k]
-        base_tangent = chart.base_tangent[e]
-        base_director = chart.base_director[e]
-        tangent = state.tangent[e]
-        if e > first:
-            segment = state.position[e] - state.position[e - 1]
-            length = wp.length(segment)
-            tangent = segment / length
-            state.length[e] = length
-            state.tangent[e] = tangent
-            base_tangent = chart.flagellum_turn[k] * base_tangent
-            base_director = chart.flagellum_turn[k] * base_director
-        director = turn(transport(base_director, base_tangent, tangent), tangent, chart.increment[e][3])
-        director = perpendicular_unit(director, tangent)
-        state.director[e] = director
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    Model, State, Chart = structs(p).Model, structs(p).State, struct(p)
+    find_rate, find_body_rate = functions(p).find_rate, functions(p).find_body_rate
+    module = p.module("chart")
 
     @wp.kernel(module=module)
     def commit_elements(
@@ -232,25 +187,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         e = wp.tid()
         c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
-        first = model.first_node[k]
-        t = state.tangent[e]
-        base = chart.base_tangent[e]
-        spin = model.spin_mobility[k] * state.spin_torque[e]
-        if e == first:
-            spin -= transport_spin(base, t, wp.cross(state.body_spin[c], t))
-            chart.rate[e] = vec4(real(0.0), real(0.0), real(0.0), spin)
-            return
-        back = wp.transpose(chart.flagellum_turn[k])
-        omega = chart.flagellum_spin[k]
-        offset = state.position[e] - state.position[first]
-        x_rate = back * (state.velocity[e] - state.velocity[first] - wp.cross(omega, offset))
-        relative = state.velocity[e] - state.velocity[e - 1]
-        t_rate = (relative - wp.dot(relative, t) * t) / state.length[e] - wp.cross(omega, t)
-        spin -= wp.dot(omega, t) + transport_spin(base, back * t, back * t_rate)
-        chart.rate[e] = vec4(x_rate[0], x_rate[1], x_rate[2], spin)
+        if state.active[c] != 0:
+            find_rate(model, state, chart, e, model.flagellum_of[e], c)
 
     @wp.kernel(module=module)
     def body_rates(
@@ -262,43 +200,36 @@ def _kernels(p: Precision) -> SimpleNamespace:
         chart: Chart,
     ):
         c = wp.tid()
+        if state.active[c] != 0:
+            find_body_rate(state, chart, c)
+
+    @wp.kernel(module=module)
+    def rates_by_cells(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        chart: Chart,
+    ):
+        c = wp.tid()
         if state.active[c] == 0:
             return
-        b = chart.body_increment[c]
-        w = wp.vec3d(b[3], b[4], b[5])
-        v = wp.vec3d(state.body_velocity[c])
-        omega = wp.vec3d(state.body_spin[c])
-        # Rate of the rotation vector: inverse of the exponential's differential.
-        angle = wp.length(w)
-        scale = wp.float64(1.0) / wp.float64(12.0)
-        if angle > wp.float64(1.0e-2):
-            half = wp.float64(0.5) * angle
-            scale = (wp.float64(1.0) - half * wp.cos(half) / wp.sin(half)) / (angle * angle)
-        wxo = wp.cross(w, omega)
-        w_rate = omega - wp.float64(0.5) * wxo + scale * wp.cross(w, wxo)
-        chart.body_rate[c] = vec6d(v[0], v[1], v[2], w_rate[0], w_rate[1], w_rate[2])
+        e = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        while e < end:
+            find_rate(model, state, chart, e, model.flagellum_of[e], c)
+            e += 1
+        find_body_rate(state, chart, c)
 
     return SimpleNamespace(
-        place_bodies=place_bodies,
-        place_flagella=place_flagella,
-        place_nodes=place_nodes,
-        place_frames=place_frames,
         commit_elements=commit_elements,
         commit_bodies=commit_bodies,
         fit_spin=fit_spin,
         rates=rates,
         body_rates=body_rates,
+        rates_by_cells=rates_by_cells,
     )
-
-
-def place(model: DeviceModel, state: DeviceState, chart: Any) -> None:
-    """State from the chart's increments."""
-    kernels = _kernels(model.precision)
-    inputs = [model.data, chart, state.data]
-    wp.launch(kernels.place_bodies, model.cell_count, inputs=inputs, device=model.device)
-    wp.launch(kernels.place_flagella, model.flagellum_count, inputs=inputs, device=model.device)
-    wp.launch(kernels.place_nodes, model.element_count, inputs=inputs, device=model.device)
-    wp.launch(kernels.place_frames, model.element_count, inputs=inputs, device=model.device)
 
 
 def commit(model: DeviceModel, state: DeviceState, chart: Any) -> None:
@@ -319,5 +250,8 @@ def increment_rates(model: DeviceModel, state: DeviceState, chart: Any) -> None:
     """Rates of the increments from the velocities, into `rate` and `body_rate`."""
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart]
+    if model.one_thread_per_cell:
+        wp.launch(kernels.rates_by_cells, model.cell_count, inputs=inputs, device=model.device)
+        return
     wp.launch(kernels.rates, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.body_rates, model.cell_count, inputs=inputs, device=model.device)

@@ -5,11 +5,11 @@ With W the compliance (see `compliance`), the gaps obey
     gap = free + W (F(gap) - acting),
 
 F the steric force, free the gaps that the forces already acting lead to. `press` sets those to begin with: the law at
-the gaps of the predicted pose, so that only changes have to go through W. Newton's method solves it, and GMRES its linear
-systems (1 + k^1/2 W k^1/2) u = -k^1/2 residual with the stiffness k = -dF/dgap: nothing but products with W is needed,
-each in time proportional to the nodes and contacts. Contacts are soft against what they rest on over one step, so a
-few products are enough, however many contacts there are. An estimate w of a contact's own compliance scales the
-systems, and takes the steepness of F out of them: Newton's steps are straight in gap - w F(gap), not in the gap.
+the gaps of the predicted pose, so that only changes have to go through W. Newton's method solves it, and GMRES its
+linear systems (1 + k^1/2 W k^1/2) u = -k^1/2 residual with the stiffness k = -dF/dgap: nothing but products with W is
+needed. Contacts are soft against what they rest on over one step, so a few are enough, however many contacts there
+are. An estimate w of a contact's own compliance scales the systems, and takes the steepness of F out of them: Newton's
+steps are straight in gap - w F(gap), not in the gap.
 """
 
 import functools

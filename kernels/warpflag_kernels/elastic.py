@@ -19,22 +19,15 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+def functions(p: Precision) -> SimpleNamespace:
+    """Device function: the energy gradients of one joint."""
+    real = p.real
     Model, State = structs(p).Model, structs(p).State
-    twist_angle, joint_strain = frames.functions(p).twist_angle, frames.functions(p).joint_strain
+    twist, angle = frames.functions(p).twist, frames.functions(p).angle
 
-    @wp.kernel(module=p.module("elastic"))
-    def joint_gradients(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-    ):
-        e = wp.tid()
-        k = model.flagellum_of[e]
-        if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
-            return  # the last segment has no joint after it: its entries stay zero
+    @wp.func(module=p.module("elastic_functions"))
+    def joint(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Joint e of flagellum k: after each of its segments but the last."""
         per_length = real(1.0) / model.segment_length[k]
         t = state.tangent[e]
         u = state.tangent[e + 1]
@@ -42,9 +35,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
         b1 = state.director[e + 1]
         per_chi = real(1.0) / (real(1.0) + wp.dot(t, u))
         kb = wp.cross(t, u) * (real(2.0) * per_chi)
-        twist = twist_angle(t, u, a1, b1)
+        sine, cosine = twist(t, u, a1, b1)
+        turned = angle(sine, cosine)
         if e == model.first_node[k]:
-            moment = model.hook_rigidity[k] * per_length * twist
+            moment = model.hook_rigidity[k] * per_length * turned
             gradient = (real(0.5) * moment) * kb
             state.joint_before[e] = gradient
             state.joint_after[e] = gradient / state.length[e + 1]
@@ -59,13 +53,35 @@ def _kernels(p: Precision) -> SimpleNamespace:
         stiffness = model.bending_rigidity[k] * per_length
         m1 = stiffness * (w1 - rest[0])
         m2 = stiffness * (w2 - rest[1])
-        m3 = model.twist_rigidity[k] * per_length * (twist - rest[2])
+        m3 = model.twist_rigidity[k] * per_length * (turned - rest[2])
         common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
         lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
         state.joint_before[e] = (common + wp.cross(u, lever)) / state.length[e]
         state.joint_after[e] = (common - wp.cross(t, lever)) / state.length[e + 1]
         state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3
         state.joint_spin_after[e] = real(0.5) * (m1 * wp.dot(kb, b2) - m2 * wp.dot(kb, b1)) + m3
+
+    return SimpleNamespace(joint=joint)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    joint, joint_strain = functions(p).joint, frames.functions(p).joint_strain
+
+    @wp.kernel(module=p.module("elastic"))
+    def joint_gradients(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+    ):
+        e = wp.tid()
+        k = model.flagellum_of[e]
+        if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
+            return  # the last segment has no joint after it: its entries stay zero
+        joint(model, state, e, k)
 
     @wp.kernel(module=p.module("elastic_energy"))
     def energy(

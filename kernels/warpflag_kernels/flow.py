@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import contacts, mobility
+from warpflag_kernels import contacts, mobility, pair_sum
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 KEPT = 512  # moving nodes of a cell up to which the coefficients of its pairs are kept
@@ -105,7 +105,7 @@ def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
     real, vec3, single = p.real, p.vec3, _single(p)
     Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
-    add_row, gather_pairs = mobility.pair_rows(single).add_row, mobility.pair_rows(single).gather_pairs
+    add_row, gather_pairs = pair_sum.rows(single).add_row, pair_sum.rows(single).gather_pairs
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
     zero = wp.constant(single.real(0.0))
     halves, kept = form != "gathered", form == "kept"

@@ -8,6 +8,12 @@ import warp as wp
 
 from warpflag_kernels.types import Precision
 
+# atan x = x + x^3 P(x^2) below tan(pi/8), the minimax polynomial to a relative error of 4e-17.
+_ARCTANGENT = (
+    -0.3333333333333015, 0.19999999999088933, -0.14285714195260032, 0.11111106653551665, -0.09090782411894727,
+    0.07690068294887187, -0.0664112115510828, 0.056925388380342015, -0.04359094867624417, 0.02125983999894584,
+)  # fmt: skip
+
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
@@ -19,6 +25,9 @@ def functions(p: Precision) -> SimpleNamespace:
     )
     cos2, cos4, cos6, cos8, cos10, cos12, cos14 = (
         wp.constant(real((-1) ** k / math.factorial(2 * k))) for k in range(1, 8)
+    )
+    atan3, atan5, atan7, atan9, atan11, atan13, atan15, atan17, atan19, atan21 = (
+        wp.constant(real(x)) for x in _ARCTANGENT
     )
 
     @wp.func(module=module)
@@ -42,6 +51,17 @@ def functions(p: Precision) -> SimpleNamespace:
         return x * s, c
 
     @wp.func(module=module)
+    def angle(s: real, c: real):
+        """atan2(s, c); up to an eighth of a turn twice that of the half angle, several times cheaper, to round-off."""
+        if wp.static(p.strict) or wp.abs(s) > c:
+            return wp.atan2(s, c)
+        x = s / (c + wp.sqrt(s * s + c * c))
+        y = x * x
+        high = atan11 + y * (atan13 + y * (atan15 + y * (atan17 + y * (atan19 + y * atan21))))
+        series = atan3 + y * (atan5 + y * (atan7 + y * (atan9 + y * high)))
+        return real(2.0) * (x + x * y * series)
+
+    @wp.func(module=module)
     def turn(v: vec3, axis: vec3, angle: real):
         """v, perpendicular to the unit axis, turned about it."""
         s, c = sine_cosine(angle)
@@ -53,10 +73,16 @@ def functions(p: Precision) -> SimpleNamespace:
         return wp.normalize(v - wp.dot(v, t) * t)
 
     @wp.func(module=module)
-    def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
-        """Angle from a1, transported from t onto u, to b1 [rad]."""
+    def twist(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """(sine, cosine) of the angle from a1, transported from t onto u, to b1."""
         pa = transport(a1, t, u)
-        return wp.atan2(wp.dot(wp.cross(pa, b1), u), wp.dot(pa, b1))
+        return wp.dot(wp.cross(pa, b1), u), wp.dot(pa, b1)
+
+    @wp.func(module=module)
+    def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
+        """That angle [rad]."""
+        s, c = twist(t, u, a1, b1)
+        return wp.atan2(s, c)
 
     @wp.func(module=module)
     def joint_strain(t: vec3, u: vec3, a1: vec3, b1: vec3):
@@ -79,8 +105,10 @@ def functions(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(
         transport=transport,
         transport_spin=transport_spin,
+        angle=angle,
         turn=turn,
         perpendicular_unit=perpendicular_unit,
+        twist=twist,
         twist_angle=twist_angle,
         joint_strain=joint_strain,
         rotation_vector_quat=rotation_vector_quat,

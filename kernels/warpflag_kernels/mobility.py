@@ -1,18 +1,7 @@
-"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum.
+"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum of `pair_sum`.
 
 Local (the paper's mu_t): [t t/gamma_par + (I - t t)/gamma_perp]/h per node (h/2 at the free end), t the normalised
-sum of the adjacent tangents, at the last node the last segment's. Pair sum, a the pair radius:
-
-    r > 2a:   1/(8 pi eta r) [(1 + 2a^2/3r^2) I + (1 - 2a^2/r^2) rr]
-    r <= 2a:  1/(6 pi eta a) [(1 - 9r/32a) I + (3r/32a) rr]
-
-It runs over the distinct nodes of the same flagellum, of the others, or both, as the scene says. r_0 belongs to the
-body: it moves with the body and its force enters the sum as zero.
-
-Every thread gathers the flows at its own node. A CPU, where one thread does a whole cell, takes every pair once for
-both nodes instead, half the square roots for the same sum.
-
-A float64 run may have its pairs in float32: `BLOCK` terms are then added up in float32, and such sums in float64.
+sum of the adjacent tangents, at the last node the last segment's.
 """
 
 import functools
@@ -20,134 +9,68 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpflag_kernels import pair_sum
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def pair_coefficients(p: Precision):
-    """Device function: 8 pi eta times the Rotne-Prager tensor as plain I + along d d, at distance r = |d|, radius a."""
-    real = p.real
+def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+    """Device functions: velocities of one node, and of all nodes of a cell."""
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
+    module = p.module("mobility_functions", _variant(p, pair, pairs, halves))
+    sums = pair_sum.functions(p, pair, pairs, halves)
+    add_cell, flow_at = sums.add_cell, sums.flow_at
 
-    @wp.func(module=p.module("mobility_functions"))
-    def rotne_prager(r: real, a: real):
-        if r > real(2.0) * a:
-            q = a * a / (r * r)
-            plain = (real(1.0) + real(2.0) / real(3.0) * q) / r
-            return plain, (real(1.0) - real(2.0) * q) / (r * r * r)
-        near = (real(4.0) / real(3.0) - real(0.375) * r / a) / a
-        if r > real(0.0):
-            return near, real(1.0) / (real(8.0) * a * a * r)
-        return near, real(0.0)
+    @wp.func(module=module)
+    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32):
+        """Velocity of node e of flagellum k of cell c."""
+        if e == model.first_node[k]:
+            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
+            return
+        t = state.tangent[e]
+        square = p.real(1.0)
+        if e + 1 < model.first_node[k + 1]:
+            t += state.tangent[e + 1]
+            square = wp.dot(t, t)
+        force = state.force[e]
+        along = (wp.dot(t, force) / square) * t
+        v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
+        if wp.static(pairs != "none"):
+            v += model.pair_mobility[c] * flow_at(model, s, e, k, c)
+        state.velocity[e] = v
 
-    return rotne_prager
+    @wp.func(module=module)
+    def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
+        """Velocities of all nodes of cell c."""
+        if wp.static(halves):
+            add_cell(model, state, s, c)
+        e = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        while e < end:
+            move_node(model, state, s, e, model.flagellum_of[e], c)
+            e += 1
 
-
-BLOCK = 64  # with fewer, float64 additions begin to show in the time; with more, float32 ones in the error
-
-# One row of the sum by halves: pairs (i, j) for j in [begin, end), counted at both nodes. A loop that adds to what it
-# reads is vectorised only if the compiler is told that no two rows overlap, which takes C++; the body is that of
-# `gather_pairs`.
-_ROW = """
-    using R = REAL;
-    const R* __restrict__ X = s.x.data; const R* __restrict__ Y = s.y.data; const R* __restrict__ Z = s.z.data;
-    const R* __restrict__ F = s.fx.data; const R* __restrict__ G = s.fy.data; const R* __restrict__ H = s.fz.data;
-    R* __restrict__ U = s.ux.data; R* __restrict__ V = s.uy.data; R* __restrict__ W = s.uz.data;
-    const R a2 = a * a, near = 4 * a2, contact = R(4) / (R(3) * a), slope = R(0.375) / a2, slope_d = R(0.125) / a2;
-    const R xi = X[i], yi = Y[i], zi = Z[i], fi = F[i], gi = G[i], hi = H[i];
-    R ui = 0, vi = 0, wi = 0;
-    #ifndef __CUDACC__
-    #pragma clang loop vectorize(assume_safety)
-    #endif
-    for (int j = begin; j < end; ++j) {
-        const R dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
-        const R r2 = dx * dx + dy * dy + dz * dz;
-        const R inv_r = R(1) / wp::sqrt(r2 > R(0) ? r2 : R(1));
-        const R inv_r2 = inv_r * inv_r, q = a2 * inv_r2;
-        const bool far = r2 > near;
-        const R ci = far ? inv_r * (R(1) + R(2) / R(3) * q) : contact - slope * (r2 * inv_r);
-        const R cd = far ? inv_r * inv_r2 * (R(1) - R(2) * q) : slope_d * inv_r;
-        const R dj = cd * (dx * F[j] + dy * G[j] + dz * H[j]), di = cd * (dx * fi + dy * gi + dz * hi);
-        ui += ci * F[j] + dj * dx; vi += ci * G[j] + dj * dy; wi += ci * H[j] + dj * dz;
-        U[j] += ci * fi + di * dx; V[j] += ci * gi + di * dy; W[j] += ci * hi + di * dz;
-    }
-    U[i] += ui; V[i] += vi; W[i] += wi;
-"""
-
-
-# Moves the float32 sums of nodes [begin, end) into the float64 ones.
-_FLUSH = """
-    float* __restrict__ U = s.ux.data; float* __restrict__ V = s.uy.data; float* __restrict__ W = s.uz.data;
-    double* __restrict__ X = s.total_x.data; double* __restrict__ Y = s.total_y.data;
-    double* __restrict__ Z = s.total_z.data;
-    for (int j = begin; j < end; ++j) {
-        X[j] += U[j]; Y[j] += V[j]; Z[j] += W[j];
-        U[j] = 0; V[j] = 0; W[j] = 0;
-    }
-"""
-
-
-@functools.cache
-def pair_rows(p: Precision) -> SimpleNamespace:
-    """Device functions of the pair sum's rows: `add_row` counts pairs at both nodes, `gather_pairs` at one."""
-    real, vec3, PairSum = p.real, p.vec3, structs(p).PairSum
-
-    @wp.func_native(_ROW.replace("REAL", {"float64": "double", "float32": "float"}[p.name]))
-    def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
-
-    @wp.func(module=p.module("mobility_functions"))
-    def gather_pairs(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
-        """Sum over nodes [begin, end) of 8 pi eta times the Rotne-Prager tensor times the force."""
-        # Scalar loads, scalar accumulators and a while loop are what lets the compiler vectorise this.
-        xi = s.x[i]
-        yi = s.y[i]
-        zi = s.z[i]
-        a2 = a * a
-        near = real(4.0) * a2
-        # The overlapping form in the same units: 8/(6a) = 4/(3a).
-        contact = real(4.0) / (real(3.0) * a)
-        slope = real(0.375) / a2
-        slope_d = real(0.125) / a2
-        ux = real(0.0)
-        uy = real(0.0)
-        uz = real(0.0)
-        j = begin
-        while j < end:
-            dx = xi - s.x[j]
-            dy = yi - s.y[j]
-            dz = zi - s.z[j]
-            fx = s.fx[j]
-            fy = s.fy[j]
-            fz = s.fz[j]
-            r2 = dx * dx + dy * dy + dz * dz
-            inv_r = real(1.0) / wp.sqrt(wp.where(r2 > real(0.0), r2, real(1.0)))
-            inv_r2 = inv_r * inv_r
-            q = a2 * inv_r2
-            far_i = inv_r * (real(1.0) + real(2.0) / real(3.0) * q)
-            far_d = inv_r * inv_r2 * (real(1.0) - real(2.0) * q)
-            ci = wp.where(r2 > near, far_i, contact - slope * (r2 * inv_r))
-            cd = wp.where(r2 > near, far_d, slope_d * inv_r)
-            other = wp.where(j == i, real(0.0), real(1.0))
-            df = other * cd * (dx * fx + dy * fy + dz * fz)
-            ci = other * ci
-            ux += ci * fx + df * dx
-            uy += ci * fy + df * dy
-            uz += ci * fz + df * dz
-            j += 1
-        return vec3(ux, uy, uz)
-
-    return SimpleNamespace(add_row=add_row, gather_pairs=gather_pairs)
+    return SimpleNamespace(move_node=move_node, move_cell=move_cell)
 
 
 @functools.cache
 def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
-    vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
+    vec3, real = p.vec3, pair.real
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
-    module = p.module("mobility", pairs + ("_halves" if halves else "") + ("_short" if short else ""))
-    within, between = pairs in ("within", "all"), pairs in ("between", "all")
-    add_row, gather_pairs = pair_rows(pair).add_row, pair_rows(pair).gather_pairs
+    f = functions(p, pair, pairs, halves)
+    move_node, move_cell = f.move_node, f.move_cell
+    module = p.module("mobility", _variant(p, pair, pairs, halves))
 
-    @wp.func(module=module)
-    def pack_node(model: Model, state: State, s: PairSum, e: wp.int32):
+    @wp.kernel(module=module)
+    def pack(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        s: PairSum,
+    ):
+        e = wp.tid()
         x = state.position[e]
         force = state.force[e]
         if e == model.first_node[model.flagellum_of[e]]:
@@ -160,83 +83,6 @@ def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleN
         s.fz[e] = real(force[2])
 
     @wp.kernel(module=module)
-    def pack(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        pack_node(model, state, s, wp.tid())
-
-    @wp.func_native(_FLUSH)
-    def flush(s: PairSum, begin: wp.int32, end: wp.int32): ...
-
-    @wp.kernel(module=module)
-    def add_rows(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        s: PairSum,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
-        begin = model.first_node[model.first_flagellum[c]]
-        end = model.first_node[model.first_flagellum[c + 1]]
-        a = real(model.pair_radius[c])
-        i = begin
-        while i < end:
-            pack_node(model, state, s, i)
-            s.ux[i] = real(0.0)
-            s.uy[i] = real(0.0)
-            s.uz[i] = real(0.0)
-            if wp.static(short):
-                s.total_x[i] = wp.float64(0.0)
-                s.total_y[i] = wp.float64(0.0)
-                s.total_z[i] = wp.float64(0.0)
-            i += 1
-        i = begin
-        while i < end:
-            own = model.first_node[model.flagellum_of[i]]
-            if i > own:
-                if wp.static(within and between):
-                    add_row(s, i, begin, i, a)
-                elif wp.static(within):
-                    add_row(s, i, own, i, a)
-                else:
-                    add_row(s, i, begin, own, a)
-            i += 1
-            if wp.static(short):
-                rows = i - begin
-                if rows % wp.static(BLOCK) == 0 or i == end:
-                    flush(s, begin, i)
-
-    @wp.func(module=module)
-    def gather_blocks(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
-        """The same in the run's precision."""
-        total = vec3()
-        j = begin
-        while j < end:
-            part = gather_pairs(s, i, j, wp.min(j + wp.static(BLOCK), end), a)
-            total += vec3(p.real(part[0]), p.real(part[1]), p.real(part[2]))
-            j += wp.static(BLOCK)
-        return total
-
-    gather = gather_blocks if short else gather_pairs
-
-    @wp.func(module=module)
-    def summed(s: PairSum, e: wp.int32):
-        """What the sum by halves found, in the run's precision."""
-        if wp.static(short):
-            return vec3(s.total_x[e], s.total_y[e], s.total_z[e])
-        else:
-            return vec3(s.ux[e], s.uy[e], s.uz[e])
-
-    @wp.kernel(module=module)
     def velocities(
         # Model:
         model: Model,
@@ -246,47 +92,35 @@ def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleN
     ):
         e = wp.tid()
         c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
-        begin = model.first_node[k]
-        end = model.first_node[k + 1]
-        if e == begin:
-            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
-            return
-        t = state.tangent[e]
-        square = p.real(1.0)
-        if e + 1 < end:
-            t += state.tangent[e + 1]
-            square = wp.dot(t, t)
-        force = state.force[e]
-        along = (wp.dot(t, force) / square) * t
-        v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
-        if wp.static(halves):
-            v += model.pair_mobility[c] * summed(s, e)
-        elif wp.static(pairs != "none"):
-            a = real(model.pair_radius[c])
-            flow = vec3()
-            if wp.static(within and between):
-                cell_begin = model.first_node[model.first_flagellum[c]]
-                cell_end = model.first_node[model.first_flagellum[c + 1]]
-                flow = gather(s, e, cell_begin, cell_end, a)
-            elif wp.static(within):
-                flow = gather(s, e, begin, end, a)
-            else:
-                cell_begin = model.first_node[model.first_flagellum[c]]
-                cell_end = model.first_node[model.first_flagellum[c + 1]]
-                flow = gather(s, e, cell_begin, begin, a)
-                flow += gather(s, e, end, cell_end, a)
-            v += model.pair_mobility[c] * flow
-        state.velocity[e] = v
+        if state.active[c] != 0:
+            move_node(model, state, s, e, model.flagellum_of[e], c)
 
-    return SimpleNamespace(pack=pack, add_rows=add_rows, velocities=velocities)
+    kernels = SimpleNamespace(pack=pack, velocities=velocities)
+    if halves:  # elsewhere it need not be compiled
+
+        @wp.kernel(module=module)
+        def by_cells(
+            # Model:
+            model: Model,
+            # State:
+            state: State,
+            s: PairSum,
+        ):
+            c = wp.tid()
+            if state.active[c] != 0:
+                move_cell(model, state, s, c)
+
+        kernels.by_cells = by_cells
+    return kernels
+
+
+def _variant(p: Precision, pair: Precision, pairs: str, halves: bool) -> str:
+    return pairs + ("_halves" if halves else "") + ("_short" if pair != p else "")
 
 
 def sums_by_halves(model: DeviceModel) -> bool:
     """Whether the pair sum visits every pair once for both nodes: where one thread does a whole cell, it pays."""
-    return model.device.is_cpu and model.switches.pairs != "none" and not model.precision.strict
+    return model.one_thread_per_cell and model.switches.pairs != "none"
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
@@ -295,7 +129,8 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     kernels, device = _kernels(model.precision, model.pair_precision, model.switches.pairs, halves), model.device
     inputs = [model.data, state.data, state.pairs]
     if halves:
-        wp.launch(kernels.add_rows, model.cell_count, inputs=inputs, device=device)
-    elif model.switches.pairs != "none":
+        wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)
+        return
+    if model.switches.pairs != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)

@@ -97,12 +97,75 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def lists(p: Precision) -> SimpleNamespace:
+    """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
     real = p.real
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
     middle, next_near = functions(p).middle, functions(p).next_near
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
+    module = p.module("neighbours_functions")
+
+    @wp.func(module=module)
+    def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
+        """1: a node of flagellum k has moved by more than half the skin; else 0."""
+        left = int(0)
+        e = model.first_node[k]
+        while e < model.first_node[k + 1]:
+            d = state.position[e] - near.position[e]
+            if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
+                left = 1
+            e += 1
+        return left
+
+    @wp.func(module=module)
+    def list_near(model: Model, state: State, near: Neighbours, e: wp.int32, c: wp.int32):
+        """The list of segment e of cell c."""
+        own = model.flagellum_of[e]
+        near.position[e] = state.position[e]
+        found = int(0)
+        if e > model.first_node[own]:
+            x = middle(state, e)
+            beyond = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e]
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                if k == own:
+                    near.earlier[e] = found
+                j = model.first_node[k] + 1
+                end = model.first_node[k + 1]
+                while j < end and k != own:
+                    distance = wp.length(x - middle(state, j))
+                    # Lengths hardly change; what they do is in the skin, like what the nodes move.
+                    if distance < beyond + skin + real(0.55) * state.length[j]:
+                        if found < slots:
+                            near.segment[e * slots + found] = j
+                        found += 1
+                    j = next_near(state.length, j, end, distance, beyond + skin + real(0.1) * state.length[j])
+                k += 1
+        near.count[e] = wp.where(found <= slots, found, -1)
+
+    @wp.func(module=module)
+    def refresh_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
+        """All lists of cell c, if one of them no longer holds."""
+        stale = int(0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            stale = wp.max(stale, has_left(model, state, near, k))
+            k += 1
+        if stale == 0:
+            return
+        e = model.first_node[model.first_flagellum[c]]
+        while e < model.first_node[model.first_flagellum[c + 1]]:
+            list_near(model, state, near, e, c)
+            e += 1
+
+    return SimpleNamespace(has_left=has_left, list_near=list_near, refresh_cell=refresh_cell)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    has_left, list_near = lists(p).has_left, lists(p).list_near
     module = p.module("neighbours")
 
     @wp.kernel(module=module)
@@ -115,14 +178,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         near: Neighbours,
     ):
         k = wp.tid()
-        left = int(0)
-        e = model.first_node[k]
-        while e < model.first_node[k + 1]:
-            d = state.position[e] - near.position[e]
-            if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
-                left = 1
-            e += 1
-        near.left[k] = left
+        near.left[k] = has_left(model, state, near, k)
 
     @wp.kernel(module=module)
     def judge(
@@ -150,30 +206,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         e = wp.tid()
         c = model.cell_of[e]
-        if near.stale[c] == 0:
-            return
-        own = model.flagellum_of[e]
-        near.position[e] = state.position[e]
-        found = int(0)
-        if e > model.first_node[own]:
-            x = middle(state, e)
-            beyond = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e]
-            k = model.first_flagellum[c]
-            while k < model.first_flagellum[c + 1]:
-                if k == own:
-                    near.earlier[e] = found
-                j = model.first_node[k] + 1
-                end = model.first_node[k + 1]
-                while j < end and k != own:
-                    distance = wp.length(x - middle(state, j))
-                    # Lengths hardly change; what they do is in the skin, like what the nodes move.
-                    if distance < beyond + skin + real(0.55) * state.length[j]:
-                        if found < slots:
-                            near.segment[e * slots + found] = j
-                        found += 1
-                    j = next_near(state.length, j, end, distance, beyond + skin + real(0.1) * state.length[j])
-                k += 1
-        near.count[e] = wp.where(found <= slots, found, -1)
+        if near.stale[c] != 0:
+            list_near(model, state, near, e, c)
 
     return SimpleNamespace(measure=measure, judge=judge, build=build)
 

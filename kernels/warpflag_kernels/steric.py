@@ -6,7 +6,8 @@ along its tangent there, so that a deep overlap still pushes back with a finite 
 
 Every pair of segments within the cutoff acts, so a contact near a vertex counts up to four times. A force at
 parameter t of a segment acts by (1 - t) on its first and t on its second node: force and torque are conserved
-exactly. Each segment sums its own pairs; both sides evaluate a pair in the same order, hence to the same bits.
+exactly. Each segment sums its own pairs; both sides evaluate a pair in the same order, hence to the same bits. One
+thread that does a whole cell takes every pair once for both sides instead, for the same sums in the same order.
 """
 
 import functools
@@ -93,15 +94,33 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def gathers(p: Precision) -> SimpleNamespace:
+    """Device functions: forces on one segment from others, on all of a cell, and of the body on one node."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Neighbours = structs(p).Neighbours
     steric_force, closest_parameters = functions(p).steric_force, functions(p).closest_parameters
     candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
     cutoff = real(CUTOFF)
+    module = p.module("steric_functions")
 
-    @wp.func(module=p.module("steric"))
+    @wp.func(module=module)
+    def nearest(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
+        """Of segments p1 q1 and p2 q2: parameters of their closest points, and the way to the first from the second."""
+        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
+        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+        return st[0], st[1], gap
+
+    @wp.func(module=module)
+    def direction(gap: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
+        """Of the force on the first of two segments along d1 and d2, across a gap of length r."""
+        # Centre lines that touch exactly have no direction of their own: part them across both.
+        normal = gap / r
+        if r <= real(1.0e-3) * diameter:
+            normal = wp.normalize(wp.cross(d1, d2))  # changes sign with the side
+        return normal
+
+    @wp.func(module=module)
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
         """Forces on the first and second node of segment e from segments of other flagella, and the sum of |F|."""
         strength = model.steric_strength[model.cell_of[e]]
@@ -127,24 +146,84 @@ def _kernels(p: Precision) -> SimpleNamespace:
                     s = real(0.0)
                     gap = vec3(real(0.0))
                     if e < j:
-                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-                        s = st[0]
-                        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+                        s, _t, gap = nearest(p1, q1, p2, q2)
                     else:
-                        st = closest_parameters(p2, q2 - p2, p1, q1 - p1)
-                        s = st[1]
-                        gap = p1 + st[1] * (q1 - p1) - (p2 + st[0] * (q2 - p2))
+                        _s, s, back = nearest(p2, q2, p1, q1)
+                        gap = -back
                     r = wp.length(gap)
                     magnitude = steric_force(r, strength, diameter)
                     if magnitude > real(0.0):
                         total += magnitude
-                        # Centre lines that touch exactly have no direction of their own: part them across both.
-                        normal = gap / r
-                        if r <= real(1.0e-3) * diameter:
-                            normal = wp.normalize(wp.cross(q1 - p1, q2 - p2))  # changes sign with the side
+                        normal = direction(gap, r, q1 - p1, q2 - p2, diameter)
                         first += ((real(1.0) - s) * magnitude) * normal
                         second += (s * magnitude) * normal
         return first, second, total
+
+    @wp.func(module=module)
+    def pairs_of_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
+        """The same forces on all segments of cell c, every pair once for both."""
+        strength = model.steric_strength[c]
+        diameter = model.steric_diameter[c]
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        e = begin
+        while e < end:
+            state.steric_first[e] = vec3(real(0.0))
+            state.steric_second[e] = vec3(real(0.0))
+            e += 1
+        e = begin + 1
+        while e < end:
+            p1 = state.position[e - 1]
+            q1 = state.position[e]
+            middle = real(0.5) * (p1 + q1)
+            reach = real(0.5) * state.length[e] + cutoff * diameter
+            n = candidates(model, near, e)
+            i = int(0)
+            while i < n:
+                j = candidate(model, near, e, i)
+                i += 1
+                if j > e:
+                    p2 = state.position[j - 1]
+                    q2 = state.position[j]
+                    away = middle - real(0.5) * (p2 + q2)
+                    within = reach + real(0.5) * state.length[j]
+                    if wp.dot(away, away) < within * within:
+                        s, t, gap = nearest(p1, q1, p2, q2)
+                        r = wp.length(gap)
+                        magnitude = steric_force(r, strength, diameter)
+                        if magnitude > real(0.0):
+                            normal = direction(gap, r, q1 - p1, q2 - p2, diameter)
+                            state.steric_first[e] += ((real(1.0) - s) * magnitude) * normal
+                            state.steric_second[e] += (s * magnitude) * normal
+                            state.steric_first[j] -= ((real(1.0) - t) * magnitude) * normal
+                            state.steric_second[j] -= (t * magnitude) * normal
+            e += 1
+
+    @wp.func(module=module)
+    def body_force(model: Model, state: State, e: wp.int32, c: wp.int32):
+        """Force of the body of cell c on node e [pN]."""
+        axis = state.body_axis[c]
+        y = state.position[e]
+        along = wp.clamp(wp.dot(y, axis), -model.body_half_length[c], model.body_half_length[c])
+        away = y - along * axis
+        square = wp.dot(away, away)
+        reach = model.body_radius[c] + cutoff * model.steric_diameter[c]
+        force = vec3(real(0.0))
+        if square < reach * reach:  # few nodes are that near: only they pay for the root
+            distance = wp.sqrt(square)
+            gap = distance - model.body_radius[c]
+            magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
+            force = (magnitude / distance) * away
+        return force
+
+    return SimpleNamespace(pairs_of=pairs_of, pairs_of_cell=pairs_of_cell, body_force=body_force)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real = p.real
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    pairs_of, body_force = gathers(p).pairs_of, gathers(p).body_force
 
     @wp.kernel(module=p.module("steric"))
     def segments(
@@ -188,19 +267,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[e]
         if e == model.first_node[model.flagellum_of[e]] or state.active[c] == 0:
             return
-        axis = state.body_axis[c]
-        y = state.position[e]
-        along = wp.clamp(wp.dot(y, axis), -model.body_half_length[c], model.body_half_length[c])
-        away = y - along * axis
-        square = wp.dot(away, away)
-        reach = model.body_radius[c] + cutoff * model.steric_diameter[c]
-        force = vec3(real(0.0))
-        if square < reach * reach:  # few nodes are that near: only they pay for the root
-            distance = wp.sqrt(square)
-            gap = distance - model.body_radius[c]
-            magnitude = steric_force(gap, model.steric_strength[c], model.steric_diameter[c])
-            force = (magnitude / distance) * away
-        state.body_contact[e] = force
+        state.body_contact[e] = body_force(model, state, e, c)
 
     return SimpleNamespace(segments=segments, magnitudes=magnitudes, body=body)
 

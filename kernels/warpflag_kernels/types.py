@@ -215,6 +215,11 @@ class DeviceModel:
         """Of the terms of the pair sum."""
         return Precision("float32", self.precision.strict) if self.switches.short_pairs else self.precision
 
+    @property
+    def one_thread_per_cell(self) -> bool:
+        """Whether a launch is cut by cells: on a CPU, where its threads take turns. The strict build is cut finer."""
+        return self.device.is_cpu and not self.precision.strict
+
 
 @dataclass(frozen=True)
 class DeviceState:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import chart, control, guard, rkc
+from warpflag_kernels import chart, control, guard, placing, rkc
 
 from warpflag.drag import filament_mobility
 from warpflag.integrators.stepper import STEP_MEMORY, System, build_step_control, restart_step_control
@@ -79,7 +79,7 @@ class RkcStepper:
     def launch_pass(self) -> None:
         s = self._system
         rkc.begin_pass(s.model, s.state, s.chart, s.control, self.steps, self.data, self._euler)
-        chart.place(s.model, s.state, s.chart)
+        placing.place(s.model, s.state, s.chart)
         launch_right_hand_side(s.model, s.state)
         # Most passes are stages inside a step: what happens between steps is not even launched there.
         wp.capture_if(s.control.at_rest, self._launch_between_steps)
