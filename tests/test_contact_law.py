@@ -231,7 +231,7 @@ class Listed:
 
     def press(self) -> None:
         s = self.bench.stepper
-        contact_law.press(self.bench.model, self.bench.state, self.bench.increment(), s._contacts, s._law)
+        contact_law.press(self.bench.model, self.bench.state, s.data.one, self.bench.increment(), s._contacts, s._law)
 
     def solve(self, start: Any, coarse: float = 1.0) -> np.ndarray:
         """The increment with the answer of the contacts."""
@@ -253,7 +253,7 @@ def listed(b: Bench, step: float = STEP, tolerance: float = FINE) -> Listed:
     s._law.tolerance.fill_(tolerance)
     s._law.failed.zero_()
     find(b)
-    contact_law.press(b.model, b.state, b.increment(), s._contacts, s._law)
+    contact_law.press(b.model, b.state, s.data.one, b.increment(), s._contacts, s._law)
     levers, solver = dense_levers(b), dense_solver(b, step, 1.3 * GAIN)
     if b.model.switches.pairs != "none":
         flow.build(b.model, b.state, s._flow, s._contacts)
@@ -499,7 +499,7 @@ def test_contacts_are_those_of_the_pose_that_is_predicted(name, device, precisio
     x = b.increment(predicted[:6], predicted[6:].reshape(-1, 4))
     chain.retract(b.model, b.state, s._now, s.data.one, x, s._trial)
     contacts.find(b.model, s._trial_state, s._trial, s._contacts)
-    contact_law.press(b.model, b.state, x, s._contacts, s._law)
+    contact_law.press(b.model, b.state, s.data.one, x, s._contacts, s._law)
     flow.build(b.model, b.state, s._flow, s._contacts)
     l.levers = dense_levers(b)
     assert l.levers.shape != before.shape or np.abs(l.levers - before).max() > 0.05

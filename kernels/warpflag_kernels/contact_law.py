@@ -91,6 +91,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         model: Model,
         # State:
         state: State,
+        share: wp.array(dtype=wp.float64),
         predicted: Increment,
         # Out:
         contacts_out: Contacts,
@@ -106,7 +107,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             law.pressed[i] = steric_force(counted, model.steric_strength[c], model.steric_diameter[c])
             law.force[i] = law.pressed[i]
             law.solved_gap[i] = gap
-            contacts_out.gap[i] = gap - gap_change(model, state, contacts_out, i, predicted)
+            contacts_out.gap[i] = gap - real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
             i += lanes
 
     @wp.func(module=module)
@@ -359,13 +360,14 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     return SimpleNamespace(press=press, solve=solve)
 
 
-def press(model: DeviceModel, state: DeviceState, predicted: Any, contacts_out: Any, law: Any) -> None:
+def press(model: DeviceModel, state: DeviceState, share: Any, predicted: Any, contacts_out: Any, law: Any) -> None:
     """Forces at the listed gaps, into `force` and `pressed`: where the solution begins.
 
     Args:
-        predicted: increment to the pose in which the contacts were found; gaps are taken back to the one it begins at.
+        share, predicted: share * predicted leads to the pose in which the contacts were found; gaps are taken back to
+            the one it begins at. share: per cell, shape [cell_count].
     """
-    inputs = [model.data, state.data, predicted, contacts_out, law]
+    inputs = [model.data, state.data, share, predicted, contacts_out, law]
     wp.launch(_kernels_of(model).press, (model.cell_count, _lanes(model)), inputs=inputs, device=model.device)
 
 

@@ -28,7 +28,7 @@ from warpflag_kernels.types import Precision, structs
 
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
-PEAK = 3.3
+PEAK = 3.8
 GAP_SHARE = 0.5  # of the error that a step may make, for what the contact law leaves over
 
 
@@ -46,6 +46,8 @@ def struct(p: Precision) -> Any:
         ratio: wp.array(dtype=wp.float64)  # w
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
         error: wp.array(dtype=real)  # [K], estimated node errors of a flagellum, their sum [um]
+        predicted: wp.array(dtype=real)  # [K], lengths of the displacements predicted for it, their sum [um]
+        trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
@@ -227,13 +229,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         turn = real(imp.ratio[c]) * last.node[first][3] + x.node[first][3]
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), turn)
         total = real(0.0)
+        foreseen = real(0.0)
         if imp.history[c] == 2:
             e = first + 1
             while e < model.first_node[k + 1]:
                 d = x.node[e] - predicted.node[e]  # third divided difference of the path
                 total += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+                p = predicted.node[e]
+                foreseen += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
                 e += 1
         imp.error[k] = total / real(12.0)
+        imp.predicted[k] = foreseen
 
     @wp.kernel(module=module)
     def decide(
@@ -256,16 +262,22 @@ def kernels(p: Precision) -> SimpleNamespace:
         dt = control.step[c]
         error = wp.float64(0.0)
         k = model.first_flagellum[c]
+        foreseen = wp.float64(0.0)
         nodes = int(0)
         while k < model.first_flagellum[c + 1]:
             error += wp.float64(imp.error[k])
+            foreseen += wp.float64(imp.predicted[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
+        missed = wp.float64(12.0) * error
         error = peak * error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
             imp.accepted[c] = 1
+            imp.trust[c] = wp.float64(0.0)
+            if missed < foreseen:
+                imp.trust[c] = wp.float64(1.0) - missed / foreseen
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)

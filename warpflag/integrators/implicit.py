@@ -118,7 +118,8 @@ class ImplicitStepper:
         i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
         i.history, i.accepted, i.evaluations = (zeros(cells, wp.int32) for _ in range(3))
-        i.error = zeros(flagella, p.real)
+        i.error, i.predicted = zeros(flagella, p.real), zeros(flagella, p.real)
+        i.trust = zeros(cells, wp.float64)
         self.data = i
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
@@ -143,9 +144,9 @@ class ImplicitStepper:
         inputs = [model.data, state.data, i, self._carried, self._carried_before, self._predicted]
         wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
         if self._touches:
-            chain.retract(model, state, self._now, i.one, self._predicted, self._trial)
+            chain.retract(model, state, self._now, i.trust, self._predicted, self._trial)
             contacts.find(model, self._trial_state, self._trial, self._contacts)
-            contact_law.press(model, state, self._predicted, self._contacts, self._law)
+            contact_law.press(model, state, i.trust, self._predicted, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)
         self._right_hand_side()
@@ -207,10 +208,11 @@ class ImplicitStepper:
         counts = np.diff(self._system.model.data.first_flagellum.numpy())
         self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
         self.data.history.zero_()
+        self.data.trust.zero_()
         restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("last_step", "step_before", "history", "evaluations", "over_implicit")
+        names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "trust")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
         for name, x in self._increments_kept().items():
