@@ -90,7 +90,7 @@ def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
 @pytest.mark.parametrize("mode", ["none", "within", "between", "all"])
 def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
     scene = cell({"hydrodynamics.mode": mode})
-    assert variants_of(launches(scene, monkeypatch), "mobility") == {mode}
+    assert variants_of(launches(scene, monkeypatch), "mobility") == {f"{mode}_thread"}
     assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{mode}_steric_body_bearing"}
     model = Simulation(scene, device="cpu").system.model.data
     assert (model.pair_radius is None) == (mode == "none")
@@ -99,7 +99,7 @@ def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
 def test_a_single_flagellum_has_no_partner(monkeypatch):
     scene = cell({"flagella.count": 1})
     kernels, both = launches(scene, monkeypatch), launches(cell(), monkeypatch)
-    assert variants_of(kernels, "mobility") == {"within"}
+    assert variants_of(kernels, "mobility") == {"within_thread"}
     assert not stages_of(kernels) & {"steric", "steric_measure"}
     crossings = [[k for k in found if k.func.__name__ == "check_crossings"] for found in (kernels, both)]
     assert [len(found) for found in crossings] == [0, 1]

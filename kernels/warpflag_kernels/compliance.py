@@ -152,7 +152,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
                     t = state.tangent[e]
                     if e + 1 < model.first_node[k + 1]:
                         t = wp.normalize(t + state.tangent[e + 1])
-                    v = flow_at(model, flow, e, k, c, loaded_end(model, flow, c))
+                    v = flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0)
                     along = wp.dot(t, v) * t
                     f += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
                 f = gain * f

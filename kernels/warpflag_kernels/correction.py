@@ -14,21 +14,21 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, body, chain, compliance, contact_law, contacts, hessian
+from warpflag_kernels import banded, body, chain, compliance, contact_law, contacts, hessian, pair_sum
 from warpflag_kernels import flow as flow_stage
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, form: str) -> SimpleNamespace:
+def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, form: str, lanes: int) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
     Contacts, Law = contacts.struct(p), compliance.struct(p)
     segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
-    Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form)
+    Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form, lanes)
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
-    variant = "_".join([*["bearing"] * bearing_torque, *["touching"] * touching, pairs, form])
+    variant = "_".join([*["bearing"] * bearing_torque, *["touching"] * touching, pairs, form, str(lanes)])
     module = p.module("correction", variant)
 
     @wp.func(module=module)
@@ -176,7 +176,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
         # Out:
         rho: Increment,
     ):
-        e = wp.tid()
+        e, lane = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
@@ -190,19 +190,20 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
         if e > model.first_node[k]:
             v = vec3(d[0], d[1], d[2]) - inv_dt * vec3(y[0], y[1], y[2])
             if wp.static(pairs != "none"):
-                v += gain * flow_at(model, flow, e, k, c, places_end(model, c))
+                v += gain * flow_at(model, flow, e, k, c, places_end(model, c), lane)
             t = state.tangent[e]
             if e + 1 < model.first_node[k + 1]:
                 t = wp.normalize(t + state.tangent[e + 1])
             along = wp.dot(t, v) * t
             v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
             v += gain * state.force[e]
-        elif k == model.first_flagellum[c]:
+        elif lane == 0 and k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]
             rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
             rho.body[c] = drive.body[c] + gain * rate - inv_dt * x.body[c]
-        rho.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+        if lane == 0:
+            rho.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)
     def add(
@@ -291,9 +292,13 @@ def defect(
         if flow_stage.form_of(model) != "gathered":
             wp.launch(kernels.add_flows, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, flow, band, law, drive, x, rho]
-    wp.launch(kernels.residual, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.residual, (model.element_count, _lanes(model)), inputs=inputs, device=device)
 
 
 def _kernels_of(model: DeviceModel, touching: bool) -> SimpleNamespace:
-    switches = model.switches
-    return _kernels(model.precision, switches.bearing_torque, touching, switches.pairs, flow_stage.form_of(model))
+    switches, form = model.switches, flow_stage.form_of(model)
+    return _kernels(model.precision, switches.bearing_torque, touching, switches.pairs, form, _lanes(model))
+
+
+def _lanes(model: DeviceModel) -> int:
+    return pair_sum.WARP if model.warp_per_node and model.switches.pairs != "none" else 1

@@ -99,17 +99,19 @@ def rows(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
+def functions(p: Precision, pairs: str, form: str, lanes: int = 1) -> SimpleNamespace:
     """Device functions for one block of threads, in this order, its lanes meeting in between: `load` every node,
-    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`."""
+    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`. Lanes: threads
+    that share what is gathered at a node, one or those of a warp."""
     real, vec3, single = p.real, p.vec3, _single(p)
     Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
-    add_row, gather_pairs = pair_sum.rows(single).add_row, pair_sum.rows(single).gather_pairs
+    add_row, gather_pairs = pair_sum.rows(single, lanes).add_row, pair_sum.rows(single, lanes).gather_pairs
+    warp_sum = pair_sum.over_warp(single)
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
     zero = wp.constant(single.real(0.0))
     halves, kept = form != "gathered", form == "kept"
-    module = p.module("flow_functions", f"{pairs}_{form}")
+    module = p.module("flow_functions", f"{pairs}_{form}_{lanes}")
 
     @wp.func(module=module)
     def load(flow: Flow, place: wp.int32, f: vec3):
@@ -169,7 +171,7 @@ def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
             i += 1
 
     @wp.func(module=module)
-    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32):
+    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32, lane: wp.int32):
         """Velocity of node e of flagellum k that the forces cause through the pair sum [um/s]."""
         i = flow.place[e]
         ux = zero
@@ -184,19 +186,21 @@ def functions(p: Precision, pairs: str, form: str) -> SimpleNamespace:
             radius = single.real(model.pair_radius[c])
             u = single.vec3(zero)
             if wp.static(within and between):
-                u = gather_pairs(flow.sum, i, begin, sources, radius)
+                u = gather_pairs(flow.sum, i, begin + lane, sources, radius)
             else:
                 start = flow.start[k]
                 loaded = start + flow.loaded[k]
                 rest = flow.rest[k]
                 others = rest + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
                 if wp.static(within):
-                    u = gather_pairs(flow.sum, i, start, wp.min(loaded, sources), radius)
-                    u += gather_pairs(flow.sum, i, rest, wp.min(others, sources), radius)
+                    u = gather_pairs(flow.sum, i, start + lane, wp.min(loaded, sources), radius)
+                    u += gather_pairs(flow.sum, i, rest + lane, wp.min(others, sources), radius)
                 else:
-                    u = gather_pairs(flow.sum, i, begin, wp.min(start, sources), radius)
-                    u += gather_pairs(flow.sum, i, loaded, wp.min(rest, sources), radius)
-                    u += gather_pairs(flow.sum, i, others, sources, radius)
+                    u = gather_pairs(flow.sum, i, begin + lane, wp.min(start, sources), radius)
+                    u += gather_pairs(flow.sum, i, loaded + lane, wp.min(rest, sources), radius)
+                    u += gather_pairs(flow.sum, i, others + lane, sources, radius)
+            if wp.static(lanes > 1):
+                u = warp_sum(u)
             ux = u[0]
             uy = u[1]
             uz = u[2]

@@ -14,16 +14,16 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
     """Device functions: velocities of one node, and of all nodes of a cell."""
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
-    module = p.module("mobility_functions", _variant(p, pair, pairs, halves))
-    sums = pair_sum.functions(p, pair, pairs, halves)
+    module = p.module("mobility_functions", _variant(p, pair, pairs, form))
+    sums = pair_sum.functions(p, pair, pairs, form)
     add_cell, flow_at = sums.add_cell, sums.flow_at
 
     @wp.func(module=module)
-    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32):
-        """Velocity of node e of flagellum k of cell c."""
+    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, lane: wp.int32):
+        """Velocity of node e of flagellum k of cell c; the lanes of a warp share its pairs."""
         if e == model.first_node[k]:
             state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
             return
@@ -36,30 +36,31 @@ def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> Simple
         along = (wp.dot(t, force) / square) * t
         v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
         if wp.static(pairs != "none"):
-            v += model.pair_mobility[c] * flow_at(model, s, e, k, c)
-        state.velocity[e] = v
+            v += model.pair_mobility[c] * flow_at(model, s, e, k, c, lane)
+        if lane == 0:
+            state.velocity[e] = v
 
     @wp.func(module=module)
     def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
         """Velocities of all nodes of cell c."""
-        if wp.static(halves):
+        if wp.static(form == "halves"):
             add_cell(model, state, s, c)
         e = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
         while e < end:
-            move_node(model, state, s, e, model.flagellum_of[e], c)
+            move_node(model, state, s, e, model.flagellum_of[e], c, 0)
             e += 1
 
     return SimpleNamespace(move_node=move_node, move_cell=move_cell)
 
 
 @functools.cache
-def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
     vec3, real = p.vec3, pair.real
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
-    f = functions(p, pair, pairs, halves)
+    f = functions(p, pair, pairs, form)
     move_node, move_cell = f.move_node, f.move_cell
-    module = p.module("mobility", _variant(p, pair, pairs, halves))
+    module = p.module("mobility", _variant(p, pair, pairs, form))
 
     @wp.kernel(module=module)
     def pack(
@@ -90,13 +91,13 @@ def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleN
         state: State,
         s: PairSum,
     ):
-        e = wp.tid()
+        e, lane = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0:
-            move_node(model, state, s, e, model.flagellum_of[e], c)
+            move_node(model, state, s, e, model.flagellum_of[e], c, lane)
 
     kernels = SimpleNamespace(pack=pack, velocities=velocities)
-    if halves:  # elsewhere it need not be compiled
+    if form == "halves":  # elsewhere it need not be compiled
 
         @wp.kernel(module=module)
         def by_cells(
@@ -114,23 +115,32 @@ def _kernels(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleN
     return kernels
 
 
-def _variant(p: Precision, pair: Precision, pairs: str, halves: bool) -> str:
-    return pairs + ("_halves" if halves else "") + ("_short" if pair != p else "")
+def _variant(p: Precision, pair: Precision, pairs: str, form: str) -> str:
+    return "_".join([pairs, form, *["short"] * (pair != p)])
+
+
+def form_of(model: DeviceModel) -> str:
+    """How the pair sum is done, see `pair_sum.functions`."""
+    if model.switches.pairs == "none":
+        return "thread"
+    if model.one_thread_per_cell:
+        return "halves"
+    return "warp" if model.warp_per_node else "thread"
 
 
 def sums_by_halves(model: DeviceModel) -> bool:
-    """Whether the pair sum visits every pair once for both nodes: where one thread does a whole cell, it pays."""
-    return model.one_thread_per_cell and model.switches.pairs != "none"
+    return form_of(model) == "halves"
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion."""
-    halves = sums_by_halves(model)
-    kernels, device = _kernels(model.precision, model.pair_precision, model.switches.pairs, halves), model.device
+    form = form_of(model)
+    kernels, device = _kernels(model.precision, model.pair_precision, model.switches.pairs, form), model.device
     inputs = [model.data, state.data, state.pairs]
-    if halves:
+    if form == "halves":
         wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)
         return
     if model.switches.pairs != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
-    wp.launch(kernels.velocities, model.element_count, inputs=inputs, device=device)
+    lanes = pair_sum.WARP if form == "warp" else 1
+    wp.launch(kernels.velocities, (model.element_count, lanes), inputs=inputs, device=device)

@@ -6,19 +6,22 @@
 It runs over the distinct nodes of the same flagellum, of the others, or both, as the scene says. r_0 belongs to the
 body: it moves with the body and its force enters the sum as zero.
 
-Every thread gathers the flows at its own node. A CPU, where one thread does a whole cell, takes every pair once for
-both nodes instead, half the square roots for the same sum.
+On a GPU the threads of a warp gather the flows at one node together, an order of magnitude faster than a thread for
+each node would, of which a cell has too few. A CPU, where one thread does a whole cell, takes every pair once for both
+nodes instead, half the square roots for the same sum.
 
 A float64 run may have its pairs in float32: `BLOCK` terms are then added up in float32, and such sums in float64.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from warpflag_kernels.types import Precision, structs
 
+WARP = 32  # threads of a warp
 BLOCK = 64  # with fewer, float64 additions begin to show in the time; with more, float32 ones in the error
 
 # Nodes [begin, end) laid out for the sum by halves, which begins at zero. That the components of a vector lie side by
@@ -75,6 +78,15 @@ _ROW = """
     U[i] += ui; V[i] += vi; W[i] += wi;
 """
 
+# The sum of what the threads of a warp hold, in the first of them.
+_WARP_SUM = """
+    #ifdef __CUDA_ARCH__
+    for (int distance = 16; distance > 0; distance /= 2)
+        for (int axis = 0; axis < 3; ++axis) v[axis] += __shfl_down_sync(0xffffffffu, v[axis], distance);
+    #endif
+    return v;
+"""
+
 # Moves the float32 sums of nodes [begin, end) into the float64 ones.
 _FLUSH = """
     float* __restrict__ U = s.ux.data; float* __restrict__ V = s.uy.data; float* __restrict__ W = s.uz.data;
@@ -93,16 +105,17 @@ def _in_cpp(source: str, pair: Precision, run: Precision) -> str:
 
 
 @functools.cache
-def rows(p: Precision) -> SimpleNamespace:
-    """Device functions of one row of pairs: `add_row` counts them at both nodes, `gather_pairs` at one."""
+def rows(p: Precision, lanes: int = 1) -> SimpleNamespace:
+    """Device functions of one row of pairs: `add_row` counts them at both nodes, `gather_pairs` at one, every so many
+    of them."""
     real, vec3, PairSum = p.real, p.vec3, structs(p).PairSum
 
     @wp.func_native(_in_cpp(_ROW, p, p))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
 
-    @wp.func(module=p.module("pair_rows"))
+    @wp.func(module=p.module("pair_rows", str(lanes)))
     def gather_pairs(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real):
-        """Sum over nodes [begin, end) of 8 pi eta times the Rotne-Prager tensor times the force."""
+        """Sum over nodes in [begin, end) of 8 pi eta times the Rotne-Prager tensor times the force."""
         # Scalar loads, scalar accumulators and a while loop are what lets the compiler vectorise this.
         xi = s.x[i]
         yi = s.y[i]
@@ -138,25 +151,38 @@ def rows(p: Precision) -> SimpleNamespace:
             ux += ci * fx + df * dx
             uy += ci * fy + df * dy
             uz += ci * fz + df * dz
-            j += 1
+            j += wp.static(lanes)
         return vec3(ux, uy, uz)
 
     return SimpleNamespace(add_row=add_row, gather_pairs=gather_pairs)
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> SimpleNamespace:
+def over_warp(p: Precision) -> Any:
+    """Device function: the sum of a vector over the threads of a warp, in the first of them."""
+    vec3 = p.vec3
+
+    @wp.func_native(_WARP_SUM)
+    def warp_sum(v: vec3) -> vec3: ...
+
+    return warp_sum
+
+
+@functools.cache
+def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
     """Device functions: the sum of a cell by halves, and the flow at a node in units of 1/(8 pi eta).
 
     Args:
         pair: precision of the terms.
         pairs: which nodes are coupled, one of `Switches.pairs`, but "none".
+        form: "halves", "warp" or "thread": pairs once for both nodes, or for one, by a warp or by a thread.
     """
     vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
     Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
-    module = p.module("pair_sum", "_".join([pairs, *["halves"] * halves, *["short"] * short]))
+    module = p.module("pair_sum", "_".join([pairs, form, *["short"] * short]))
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
-    add_row, gather_pairs = rows(pair).add_row, rows(pair).gather_pairs
+    halves, lanes = form == "halves", WARP if form == "warp" else 1
+    add_row, gather_pairs, warp_sum = rows(pair, lanes).add_row, rows(pair, lanes).gather_pairs, over_warp(p)
 
     @wp.func_native(_in_cpp(_PACK, pair, p))
     def pack_cell(
@@ -209,16 +235,16 @@ def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> Simple
         total = vec3()
         j = begin
         while j < end:
-            part = gather_pairs(s, i, j, wp.min(j + wp.static(BLOCK), end), a)
+            part = gather_pairs(s, i, j, wp.min(j + wp.static(BLOCK * lanes), end), a)
             total += vec3(p.real(part[0]), p.real(part[1]), p.real(part[2]))
-            j += wp.static(BLOCK)
+            j += wp.static(BLOCK * lanes)
         return total
 
     gather = gather_blocks if short else gather_pairs
 
     @wp.func(module=module)
-    def flow_at(model: Model, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32):
-        """Flow at node e of flagellum k of cell c; by halves, `add_cell` has found it."""
+    def flow_at(model: Model, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, lane: wp.int32):
+        """Flow at node e of flagellum k of cell c: by halves what `add_cell` has found, in the first lane of a warp."""
         if wp.static(halves and short):
             return vec3(s.total_x[e], s.total_y[e], s.total_z[e])
         elif wp.static(halves):
@@ -226,13 +252,18 @@ def functions(p: Precision, pair: Precision, pairs: str, halves: bool) -> Simple
         else:
             begin = model.first_node[k]
             end = model.first_node[k + 1]
-            a = real(model.pair_radius[c])
-            if wp.static(within and not between):
-                return gather(s, e, begin, end, a)
             cell_begin = model.first_node[model.first_flagellum[c]]
             cell_end = model.first_node[model.first_flagellum[c + 1]]
-            if wp.static(within):
-                return gather(s, e, cell_begin, cell_end, a)
-            return gather(s, e, cell_begin, begin, a) + gather(s, e, end, cell_end, a)
+            a = real(model.pair_radius[c])
+            v = vec3()
+            if wp.static(within and between):
+                v = gather(s, e, cell_begin + lane, cell_end, a)
+            elif wp.static(within):
+                v = gather(s, e, begin + lane, end, a)
+            else:
+                v = gather(s, e, cell_begin + lane, begin, a) + gather(s, e, end + lane, cell_end, a)
+            if wp.static(lanes > 1):
+                v = warp_sum(v)
+            return v
 
     return SimpleNamespace(add_cell=add_cell, flow_at=flow_at)

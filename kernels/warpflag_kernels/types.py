@@ -220,6 +220,11 @@ class DeviceModel:
         """Whether a launch is cut by cells: on a CPU, where its threads take turns. The strict build is cut finer."""
         return self.device.is_cpu and not self.precision.strict
 
+    @property
+    def warp_per_node(self) -> bool:
+        """Whether the threads of a warp share a node's pairs: on a GPU."""
+        return self.device.is_cuda
+
 
 @dataclass(frozen=True)
 class DeviceState:

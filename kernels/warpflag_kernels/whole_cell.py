@@ -22,7 +22,7 @@ def _kernel(p: Precision, pair: Precision, switches: Switches):
     gather = forces.functions(p, with_steric, with_body).gather
     motion = body.functions(p, with_body, switches.bearing_torque)
     sum_flagellum, move = motion.sum_flagellum, motion.move
-    move_cell = mobility.functions(p, pair, pairs, halves=pairs != "none").move_cell
+    move_cell = mobility.functions(p, pair, pairs, "thread" if pairs == "none" else "halves").move_cell
     words = {pairs: True, "short": pair != p, "steric": with_steric, "body": with_body}
     words["bearing"] = switches.bearing_torque
 
