@@ -105,7 +105,7 @@ def test_a_single_flagellum_has_no_partner(monkeypatch):
     assert [len(found) for found in crossings] == [0, 1]
     assert Simulation(scene, device="cpu").system.guard.position is None
     between = cell({"flagella.count": 1, "hydrodynamics.mode": "between"})
-    assert variants_of(launches(between, monkeypatch), "mobility") == {"none"}
+    assert variants_of(launches(between, monkeypatch), "mobility") == {"none_thread"}
 
 
 @pytest.mark.parametrize("stepper", ["rkc", "euler", "implicit"])
