@@ -58,7 +58,7 @@ def launched(
     with monkeypatch.context() as patch:
         if not by_cells:
             patch.setattr(DeviceModel, "one_thread_per_cell", False)
-            patch.setattr(DeviceModel, "warp_per_node", True)
+            patch.setattr(DeviceModel, "threads_cooperate", True)
             patch.setattr(banded, "columns_apart", lambda model: True)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel

@@ -398,7 +398,7 @@ def solve(
 
 
 def _lanes(model: DeviceModel) -> int:
-    return 1 if model.device.is_cpu else LANES
+    return LANES if model.threads_cooperate else 1
 
 
 def _kernels_of(model: DeviceModel) -> SimpleNamespace:

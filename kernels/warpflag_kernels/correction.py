@@ -301,4 +301,4 @@ def _kernels_of(model: DeviceModel, touching: bool) -> SimpleNamespace:
 
 
 def _lanes(model: DeviceModel) -> int:
-    return pair_sum.WARP if model.warp_per_node and model.switches.pairs != "none" else 1
+    return pair_sum.WARP if model.threads_cooperate and model.switches.pairs != "none" else 1

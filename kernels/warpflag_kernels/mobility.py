@@ -125,7 +125,7 @@ def form_of(model: DeviceModel) -> str:
         return "thread"
     if model.one_thread_per_cell:
         return "halves"
-    return "warp" if model.warp_per_node else "thread"
+    return "warp" if model.threads_cooperate else "thread"
 
 
 def sums_by_halves(model: DeviceModel) -> bool:

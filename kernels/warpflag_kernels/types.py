@@ -221,8 +221,8 @@ class DeviceModel:
         return self.device.is_cpu and not self.precision.strict
 
     @property
-    def warp_per_node(self) -> bool:
-        """Whether the threads of a warp share a node's pairs: on a GPU."""
+    def threads_cooperate(self) -> bool:
+        """Whether several threads work together on one node or one cell: on a GPU."""
         return self.device.is_cuda
 
 
