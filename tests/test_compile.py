@@ -49,7 +49,7 @@ def launched(
 ) -> set[Any]:
     """Kernels that a run of this kind launches, without compiling or running one.
 
-    halves: with the pair sum and the body's columns as a CPU takes them.
+    halves: with the pair sum and the flagella as a CPU takes them.
     """
     kernels = set()
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
@@ -57,7 +57,7 @@ def launched(
     with monkeypatch.context() as patch:
         if not halves:
             patch.setattr(mobility, "sums_by_halves", lambda model: False)
-            patch.setattr(banded, "columns_apart", lambda model: True)
+            patch.setattr(banded, "side_by_side", lambda model: False)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:

@@ -45,17 +45,17 @@ def collected() -> Iterator[set[Any]]:
     """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
-    by_halves, apart = mobility.sums_by_halves, banded.columns_apart
+    by_halves, lanes = mobility.sums_by_halves, banded.side_by_side
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
         mobility.sums_by_halves = lambda _model: False  # which is for a CPU
-        banded.columns_apart = lambda _model: True
+        banded.side_by_side = lambda _model: False
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
-        mobility.sums_by_halves, banded.columns_apart = by_halves, apart
+        mobility.sums_by_halves, banded.side_by_side = by_halves, lanes
 
 
 def launched(precision: str, stepper: str) -> set[Any]:

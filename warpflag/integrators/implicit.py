@@ -24,6 +24,7 @@ from warpflag_kernels import (
     guard,
     hessian,
     implicit,
+    lanes,
     mobility,
     stability,
 )
@@ -109,6 +110,7 @@ class ImplicitStepper:
         b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
         b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(elements, bt.mat46)
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
+        b.lanes = lanes.build(p, model.data.first_flagellum.numpy(), model.data.first_node.numpy(), device)
         self._band = b
 
         self._contacts, self._law = self._contact_arrays()
