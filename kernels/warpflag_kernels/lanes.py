@@ -10,6 +10,7 @@ Clang's vector types are what makes vector code of this, hence C++. The mathemat
 
 import functools
 import itertools
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -169,7 +170,7 @@ _BODY = {
         }""",
     "ROOM": "columns",
     "COLUMNS": "6",
-    "MANY": "2",
+    "MANY": "3",
 }
 
 _FACTORISE = """
@@ -254,7 +255,7 @@ def functions(p: Precision) -> SimpleNamespace:
         text = _GROUP.replace("CASES", " ".join(case.format(w) for w in widths)).replace("BODY", body)
         for word, value in {**words, "BLOCKS": str(BLOCKS), "REAL": name}.items():
             text = text.replace(word, value)
-        return text
+        return re.sub(r"for \(int [rcml] ", r'_Pragma("clang loop unroll(full)") \g<0>', text)
 
     @wp.func_native(code(_FACTORISE, {}))
     def factorise(
