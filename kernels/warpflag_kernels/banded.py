@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import chain, cholesky, hessian, lanes
+from warpflag_kernels import band_lanes, chain, cholesky, hessian, lanes
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
@@ -28,14 +28,14 @@ def types(p: Precision) -> SimpleNamespace:
     mat44 = wp.types.matrix((4, 4), real)
     mat46 = wp.types.matrix((4, 6), real)
     mat66 = wp.types.matrix((6, 6), real)
-    Lanes = lanes.struct(p)
+    Groups, Factors = lanes.struct(), band_lanes.struct(p)
 
     @wp.struct
     class Band:
         # Per cell [C], set by the stepper.
         step: wp.array(dtype=wp.float64)  # dt [s]
         weight: wp.array(dtype=wp.float64)  # s
-        # Blocks of row i [E]: to i, i - 1, i - 2; replaced by C_ii^-1, C_(i,i-1), C_(i,i-2), unless `lanes` has these.
+        # Blocks of row i [E]: to i, i - 1, i - 2; replaced by C_ii^-1, C_(i,i-1), C_(i,i-2) unless in `factors`.
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
@@ -46,7 +46,9 @@ def types(p: Precision) -> SimpleNamespace:
         body_columns: wp.array(dtype=mat46)  # [E]: W
         body_inverse: wp.array(dtype=mat66)  # [C]: S^-1
         singular: wp.array(dtype=wp.int32)  # [C], 1: a pivot was not positive
-        lanes: Lanes  # factors of flagella side by side
+        # Flagella side by side.
+        groups: Groups
+        factors: Factors
 
     return SimpleNamespace(mat44=mat44, mat46=mat46, mat66=mat66, vec6=wp.types.vector(6, real), Band=Band)
 
@@ -56,7 +58,7 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions of the band: the body's mobility, and the solution along one flagellum."""
     vec3, vec6 = p.vec3, types(p).vec6
     Model, State, Band, Increment = structs(p).Model, structs(p).State, types(p).Band, chain.types(p).Increment
-    solve, solve_group = cholesky.functions(p).solve, lanes.functions(p).solve
+    solve, solve_group = cholesky.functions(p).solve, band_lanes.functions(p).solve
 
     @wp.func(module=p.module("banded_functions"))
     def body_mobility(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
@@ -76,9 +78,9 @@ def functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=p.module("banded_functions"))
     def solve_cell(model: Model, band: Band, c: wp.int32, x: Increment):
         """The same for every flagellum of cell c, side by side."""
-        g = band.lanes.first_group[c]
-        while g < band.lanes.first_group[c + 1]:
-            solve_group(band.lanes, g, model.first_node, x.node)
+        g = band.groups.first_group[c]
+        while g < band.groups.first_group[c + 1]:
+            solve_group(band.groups, band.factors, g, model.first_node, x.node)
             g += 1
 
     return SimpleNamespace(body_mobility=body_mobility, solve_flagellum=solve_flagellum, solve_cell=solve_cell)
@@ -93,7 +95,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     body_mobility, solve_flagellum = functions(p).body_mobility, functions(p).solve_flagellum
     factorise_along, solve_column = cholesky.functions(p).factorise, cholesky.functions(p).solve_column
-    column_of, of_group = cholesky.functions(p).column_of, lanes.functions(p)
+    column_of, of_group = cholesky.functions(p).column_of, band_lanes.functions(p)
     factorise_group, solve_columns, solve_group = of_group.factorise, of_group.columns, of_group.solve
     module = p.module("banded", "bearing" if bearing_torque else "")
 
@@ -261,10 +263,11 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         band: Band,
     ):
         g = wp.tid()
-        c = model.cell_of[model.first_node[band.lanes.first[g]]]
+        c = model.cell_of[model.first_node[band.groups.first[g]]]
         if state.active[c] != 0:
             factorise_group(
-                band.lanes, g, c, model.first_node, band.diagonal, band.lower1, band.lower2, band.singular
+                band.groups, band.factors, g, model.first_node,
+                band.diagonal, band.lower1, band.lower2, band.singular, c,
             )  # fmt: skip
 
     @wp.kernel(module=module)
@@ -305,12 +308,14 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         band: Band,
     ):
         g = wp.tid()
-        k = band.lanes.first[g]
-        end = k + band.lanes.count[g]
+        k = band.groups.first[g]
+        end = k + band.groups.count[g]
         c = model.cell_of[model.first_node[k]]
         if state.active[c] == 0:
             return
-        solve_columns(band.lanes, g, model.first_node, real(band.weight[c]), band.to_body, band.body_columns)
+        solve_columns(
+            band.groups, band.factors, g, model.first_node, real(band.weight[c]), band.to_body, band.body_columns
+        )
         while k < end:
             first = model.first_node[k]
             shared = band.body_block[k]
@@ -421,8 +426,8 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         x: Increment,
     ):
         g = wp.tid()
-        if state.active[model.cell_of[model.first_node[band.lanes.first[g]]]] != 0:
-            solve_group(band.lanes, g, model.first_node, x.node)
+        if state.active[model.cell_of[model.first_node[band.groups.first[g]]]] != 0:
+            solve_group(band.groups, band.factors, g, model.first_node, x.node)
 
     @wp.kernel(module=module)
     def solve_bodies(
@@ -495,7 +500,7 @@ def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any)
     wp.launch(kernels.couple_body, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band]
     if side_by_side(model):
-        groups = len(band.lanes.first)
+        groups = len(band.groups.first)
         wp.launch(kernels.factorise_groups, groups, inputs=inputs, device=device)
         wp.launch(kernels.body_columns_of_groups, groups, inputs=inputs, device=device)
     else:
@@ -509,7 +514,7 @@ def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
     kernels = _kernels_for(model)
     inputs, device = [model.data, state.data, band, x], model.device
     if side_by_side(model):
-        wp.launch(kernels.solve_groups, len(band.lanes.first), inputs=inputs, device=device)
+        wp.launch(kernels.solve_groups, len(band.groups.first), inputs=inputs, device=device)
     else:
         wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.solve_bodies, model.cell_count, inputs=inputs, device=device)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels import (
+    band_lanes,
     banded,
     body,
     chain,
@@ -24,7 +25,6 @@ from warpflag_kernels import (
     guard,
     hessian,
     implicit,
-    lanes,
     mobility,
     stability,
 )
@@ -110,7 +110,7 @@ class ImplicitStepper:
         b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
         b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(elements, bt.mat46)
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
-        b.lanes = lanes.build(p, model.data.first_flagellum.numpy(), model.data.first_node.numpy(), device)
+        b.groups, b.factors = model.groups, band_lanes.build(p, model.groups)
         self._band = b
 
         self._contacts, self._law = self._contact_arrays()
