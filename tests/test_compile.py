@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels import banded, mobility
+from warpflag_kernels import lanes, mobility
 
 from tests.helpers import cell
 from warpflag.simulation import Simulation
@@ -57,7 +57,7 @@ def launched(
     with monkeypatch.context() as patch:
         if not halves:
             patch.setattr(mobility, "sums_by_halves", lambda model: False)
-            patch.setattr(banded, "side_by_side", lambda model: False)
+            patch.setattr(lanes, "side_by_side", lambda model: False)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from warpflag_kernels import banded, correction, elastic, flow
+from warpflag_kernels import banded, correction, elastic, flow, lanes
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, bench, close, dense_system, displacements, flat, spins
 from tests.helpers import (
@@ -251,7 +251,7 @@ def test_flagella_side_by_side_are_those_one_by_one(values, device, precision, m
     right = np.random.default_rng(5).uniform(-1, 1, (b.count, 4))
     found = {}
     for together in (False, True):
-        monkeypatch.setattr(banded, "side_by_side", lambda model, together=together: together and model.device.is_cpu)
+        monkeypatch.setattr(lanes, "side_by_side", lambda model, together=together: together and model.device.is_cpu)
         band, y = b.factorise(1e-5, 0.9), b.increment(1.0, right)
         banded.solve(b.model, b.state, band, y)
         found[together] = [a.numpy().copy() for a in (band.body_columns, band.body_block, band.body_inverse)]

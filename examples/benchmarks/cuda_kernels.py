@@ -32,7 +32,7 @@ import warpflag_kernels
 from cells import spread
 from cubin import Usage, usage
 from harness import table
-from warpflag_kernels import banded, mobility
+from warpflag_kernels import lanes, mobility
 
 from warpflag.scene import with_values
 from warpflag.simulation import Simulation
@@ -45,17 +45,17 @@ def collected() -> Iterator[set[Any]]:
     """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
-    by_halves, lanes = mobility.sums_by_halves, banded.side_by_side
+    by_halves, together = mobility.sums_by_halves, lanes.side_by_side
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
         mobility.sums_by_halves = lambda _model: False  # which is for a CPU
-        banded.side_by_side = lambda _model: False
+        lanes.side_by_side = lambda _model: False
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
-        mobility.sums_by_halves, banded.side_by_side = by_halves, lanes
+        mobility.sums_by_halves, lanes.side_by_side = by_halves, together
 
 
 def launched(precision: str, stepper: str) -> set[Any]:

@@ -483,11 +483,6 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
     )
 
 
-def side_by_side(model: DeviceModel) -> bool:
-    """Whether the flagella of a cell share vector registers. A strict build takes them one by one, as a GPU does."""
-    return model.device.is_cpu and not model.precision.strict
-
-
 def _kernels_for(model: DeviceModel) -> SimpleNamespace:
     return _kernels(model.precision, model.switches.bearing_torque)
 
@@ -499,7 +494,7 @@ def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any)
     wp.launch(kernels.assemble, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.couple_body, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band]
-    if side_by_side(model):
+    if lanes.side_by_side(model):
         groups = len(band.groups.first)
         wp.launch(kernels.factorise_groups, groups, inputs=inputs, device=device)
         wp.launch(kernels.body_columns_of_groups, groups, inputs=inputs, device=device)
@@ -513,7 +508,7 @@ def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
     """P: from D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place."""
     kernels = _kernels_for(model)
     inputs, device = [model.data, state.data, band, x], model.device
-    if side_by_side(model):
+    if lanes.side_by_side(model):
         wp.launch(kernels.solve_groups, len(band.groups.first), inputs=inputs, device=device)
     else:
         wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.types import Precision
+from warpflag_kernels.types import DeviceModel, Precision
 
 REGISTER = 64  # bytes of the widest vector register
 
@@ -36,6 +36,11 @@ def struct() -> Any:
         start: wp.array(dtype=wp.int32)
 
     return Groups
+
+
+def side_by_side(model: DeviceModel) -> bool:
+    """Whether the flagella of a cell share vector registers. A strict build takes them one by one, as a GPU does."""
+    return model.device.is_cpu and not model.precision.strict
 
 
 def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, device: Any) -> Any:
