@@ -23,9 +23,7 @@ def struct(p: Precision) -> Any:
     @wp.struct
     class Factors:
         blocks: wp.array(dtype=real)  # NUMBERS per row
-        # Work space.
-        solution: wp.array(dtype=real)  # 4 per row
-        columns: wp.array(dtype=real)  # 4 x 6 per row
+        solution: wp.array(dtype=real)  # 4 per row; work space
 
     return Factors
 
@@ -33,58 +31,62 @@ def struct(p: Precision) -> Any:
 def build(p: Precision, groups: Any) -> Any:
     """Room for the factors of these groups."""
     factors, size = struct(p)(), int(groups.start.numpy()[-1])
-    for name, numbers in (("blocks", NUMBERS), ("solution", 4), ("columns", 24)):
+    for name, numbers in (("blocks", NUMBERS), ("solution", 4)):
         setattr(factors, name, wp.zeros(numbers * size, dtype=p.real, device=groups.start.device))
     return factors
 
 
-# A row of factors is C_ii^-1, lower triangle, C_(i,i-1) and C_(i,i-2).
+# A row of factors is C_ii^-1, lower triangle, C_(i,i+1) and C_(i,i+2).
 _PLACES = """
-    const size_t start = groups.start.data[g];
+    R* F = factors.blocks.data + NUMBERS * (size_t)groups.start.data[g];
     auto get = [](const R* from) { V v; __builtin_memcpy(&v, from, sizeof(V)); return v; };
     auto put = [](R* to, V v) { __builtin_memcpy(to, &v, sizeof(V)); };
 """
 
-# Right-hand sides are taken MANY at a time, which share the loads of the blocks.
+# Right-hand sides are taken MANY at a time, which share the loads of the blocks; all are zero from row FILLED on.
 _SOLVE = """
     for (int column = 0; column < COLUMNS; column += MANY) {
-        R* F = factors.blocks.data + NUMBERS * start;
-        R* S = factors.ROOM.data + 4 * COLUMNS * start + 4 * column * W;
+        ROOM
         V p[4][MANY], q[4][MANY];  // solutions of the last two rows
         for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) p[r][m] = q[r][m] = zero;
-        for (int i = 0; i < rows; ++i, F += NUMBERS * W, S += 4 * COLUMNS * W) {
+        for (int i = (FILLED < rows ? FILLED : rows) - 1; i >= 0; --i) {
+            const R* block = F + NUMBERS * W * i;
             V b[4][MANY];
             LOAD
             for (int c = 0; c < 4; ++c) for (int r = 0; r < 4; ++r) {
-                const V f1 = get(F + (10 + 4 * r + c) * W), f2 = get(F + (26 + 4 * r + c) * W);
+                const V f1 = get(block + (10 + 4 * r + c) * W), f2 = get(block + (26 + 4 * r + c) * W);
                 for (int m = 0; m < MANY; ++m) b[r][m] -= f1 * p[c][m] + f2 * q[c][m];
             }
             for (int r = 0, t = 0; r < 4; ++r) {
                 for (int m = 0; m < MANY; ++m) { q[r][m] = p[r][m]; p[r][m] = zero; }
                 for (int c = 0; c <= r; ++c, ++t)
-                    for (int m = 0; m < MANY; ++m) p[r][m] += get(F + t * W) * b[c][m];
+                    for (int m = 0; m < MANY; ++m) p[r][m] += get(block + t * W) * b[c][m];
             }
-            for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) put(S + (r * MANY + m) * W, p[r][m]);
+            for (int r = 0; r < 4; ++r)
+                for (int m = 0; m < MANY; ++m) put(S + ((4 * i + r) * MANY + m) * W, p[r][m]);
         }
         for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) p[r][m] = q[r][m] = zero;
         // Here they are what the rows already solved take away from the next one, and from the one after.
-        for (int i = rows - 1; i >= 0; --i) {
-            F -= NUMBERS * W;
-            S -= 4 * COLUMNS * W;
+        for (int i = 0; i < rows; ++i) {
+            const R* block = F + NUMBERS * W * i;
             V y[4][MANY];
             for (int c = 0; c < 4; ++c) for (int m = 0; m < MANY; ++m) y[c][m] = zero;
             for (int r = 0, t = 0; r < 4; ++r) {
                 V b[MANY];
-                for (int m = 0; m < MANY; ++m) b[m] = get(S + (r * MANY + m) * W) - p[r][m];
+                for (int m = 0; m < MANY; ++m)
+                    b[m] = (i < FILLED ? get(S + ((4 * i + r) * MANY + m) * W) : zero) - p[r][m];
                 for (int c = 0; c <= r; ++c, ++t)
-                    for (int m = 0; m < MANY; ++m) y[c][m] += get(F + t * W) * b[m];
+                    for (int m = 0; m < MANY; ++m) y[c][m] += get(block + t * W) * b[m];
             }
             for (int c = 0; c < 4; ++c) for (int m = 0; m < MANY; ++m) { p[c][m] = q[c][m]; q[c][m] = zero; }
             for (int c = 0; c < 4; ++c) for (int r = 0; r < 4; ++r) {
-                const V f1 = get(F + (10 + 4 * r + c) * W), f2 = get(F + (26 + 4 * r + c) * W);
+                const V f1 = get(block + (10 + 4 * r + c) * W), f2 = get(block + (26 + 4 * r + c) * W);
                 for (int m = 0; m < MANY; ++m) { p[c][m] += f1 * y[r][m]; q[c][m] += f2 * y[r][m]; }
             }
-            STORE
+            for (int l = 0; l < W; ++l) if (i <= last[l]) {
+                R* to = (R*)x.data + 4 * COLUMNS * (node[l] + i) + column;
+                for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) to[COLUMNS * r + m] = y[r][m][l];
+            }
         }
     }
 """
@@ -95,54 +97,46 @@ _NODES = {
             const R* from = (const R*)x.data + 4 * element(l, i);
             for (int r = 0; r < 4; ++r) b[r][0][l] = from[r];
         }""",
-    "STORE": """
-        for (int l = 0; l < W; ++l) {
-            R* to = (R*)x.data + 4 * element(l, i);
-            for (int r = 0; r < 4; ++r) to[r] = y[r][0][l];
-        }""",
-    "ROOM": "solution",
+    "FILLED": "rows",
+    "ROOM": "R* S = factors.solution.data + 4 * (size_t)groups.start.data[g];",
     "COLUMNS": "1",
     "MANY": "1",
 }
 
 _BODY = {
     "LOAD": """
-        for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) b[r][m] = zero;
-        if (i < 3) for (int l = 0; l < W; ++l) {
+        for (int l = 0; l < W; ++l) {
             const R* from = (const R*)to_body.data + 24 * (3 * flagellum[l] + i) + column;
             for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) b[r][m][l] = weight * from[6 * r + m];
         }""",
-    "STORE": """
-        for (int l = 0; l < W; ++l) {
-            R* to = (R*)x.data + 24 * element(l, i) + column;
-            for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) to[6 * r + m] = y[r][m][l];
-        }""",
-    "ROOM": "columns",
+    "FILLED": "3",
+    "ROOM": "R S[3 * 4 * MANY * W];",
     "COLUMNS": "6",
     "MANY": "3",
 }
 
 _FACTORISE = """
-    V c1_before[4][4], inverse1[4][4], inverse2[4][4];  // C_(i-1,i-2); C^-1 of the last two rows
+    V c1_before[4][4], inverse1[4][4], inverse2[4][4];  // C_(i+1,i+2); C^-1 of the last two rows
     for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) c1_before[r][c] = inverse1[r][c] = inverse2[r][c] = zero;
     auto positive = zero == zero;
-    R* F = factors.blocks.data + NUMBERS * start;
-    for (int i = 0; i < rows; ++i, F += NUMBERS * W) {
+    for (int i = rows - 1; i >= 0; --i) {
+        R* block = F + NUMBERS * W * i;
         V d[4][4], c1[4][4], c2[4][4];
         for (int l = 0; l < W; ++l) {
-            const int at = 16 * element(l, i);
-            const R *from = (const R*)diagonal.data + at, *from1 = (const R*)lower1.data + at;
-            const R* from2 = (const R*)lower2.data + at;
+            const R* from = (const R*)diagonal.data + 16 * element(l, i);
+            const R* from1 = (const R*)lower1.data + 16 * element(l, i + 1);
+            const R* from2 = (const R*)lower2.data + 16 * element(l, i + 2);
             for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) {
                 if (c <= r) d[r][c][l] = from[4 * r + c];
-                c1[r][c][l] = from1[4 * r + c];
-                c2[r][c][l] = from2[4 * r + c];
+                c1[r][c][l] = from1[4 * c + r];
+                c2[r][c][l] = from2[4 * c + r];
             }
         }
-        if (i >= shortest) for (int l = 0; l < W; ++l) if (i > last[l])
+        if (i + 2 >= shortest) for (int l = 0; l < W; ++l)
             for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) {
-                if (c <= r) d[r][c][l] = r == c;
-                c1[r][c][l] = c2[r][c][l] = 0;
+                if (c <= r && i > last[l]) d[r][c][l] = r == c;
+                if (i + 1 > last[l]) c1[r][c][l] = 0;
+                if (i + 2 > last[l]) c2[r][c][l] = 0;
             }
         for (int r = 0; r < 4; ++r) {  // every row of c1 and c2 from its end: what is still needed stands before
             for (int c = 3; c >= 0; --c) {
@@ -160,8 +154,8 @@ _FACTORISE = """
                 for (int m = 0; m < 4; ++m) d[r][c] -= c1[r][m] * c1[c][m] + c2[r][m] * c2[c][m];
         }
         for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) {
-            put(F + (10 + 4 * r + c) * W, c1[r][c]);
-            put(F + (26 + 4 * r + c) * W, c2[r][c]);
+            put(block + (10 + 4 * r + c) * W, c1[r][c]);
+            put(block + (26 + 4 * r + c) * W, c2[r][c]);
             c1_before[r][c] = c1[r][c];
             inverse2[r][c] = inverse1[r][c];
         }
@@ -182,7 +176,7 @@ _FACTORISE = """
         }
         for (int r = 0, t = 0; r < 4; ++r) for (int c = 0; c <= r; ++c, ++t) {
             inverse1[r][c] = valid ? inverse1[r][c] : zero;
-            put(F + t * W, inverse1[r][c]);
+            put(block + t * W, inverse1[r][c]);
         }
     }
     for (int l = 0; l < W; ++l) if (!positive[l]) singular.data[cell] = 1;
