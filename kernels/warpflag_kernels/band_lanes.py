@@ -126,11 +126,9 @@ _FACTORISE = """
             const R* from = (const R*)diagonal.data + 16 * element(l, i);
             const R* from1 = (const R*)lower1.data + 16 * element(l, i + 1);
             const R* from2 = (const R*)lower2.data + 16 * element(l, i + 2);
-            for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) {
-                if (c <= r) d[r][c][l] = from[4 * r + c];
-                c1[r][c][l] = from1[4 * c + r];
-                c2[r][c][l] = from2[4 * c + r];
-            }
+            for (int r = 0; r < 4; ++r) for (int c = 0; c <= r; ++c) d[r][c][l] = from[4 * r + c];
+            for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) c1[c][r][l] = from1[4 * r + c];
+            for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) c2[c][r][l] = from2[4 * r + c];
         }
         if (i + 2 >= shortest) for (int l = 0; l < W; ++l)
             for (int r = 0; r < 4; ++r) for (int c = 0; c < 4; ++c) {
