@@ -9,7 +9,7 @@ import warp as wp
 from warpflag_kernels import lanes
 from warpflag_kernels.types import Precision
 
-SMALL = 0.35  # half the angle of a turn up to which the series hold to round-off [rad]
+SMALL = 0.35**2  # square of half the angle of a turn up to which the series hold to round-off [rad^2]
 
 
 def _series(first: int) -> str:
@@ -75,24 +75,27 @@ _ROWS = """
         cross(t, d, w);
         for (int r = 0; r < 3; ++r) w[r] += s * xe[3] * t[r];
         // The quaternion of the turn.
-        const V angle = __builtin_elementwise_sqrt(dot(w, w)), half = R(0.5) * angle, y2 = half * half;
+        const V y2 = R(0.25) * dot(w, w);
         V sine = R(0.5) * SINE, cosine = COSINE;
-        if (__builtin_reduce_max(half) > R(SMALL))
-            for (int l = 0; l < W; ++l) if (half[l] > R(SMALL)) {
-                sine[l] = wp::sin(half[l]) / angle[l];
-                cosine[l] = wp::cos(half[l]);
+        if (__builtin_reduce_max(y2) > R(SMALL))
+            for (int l = 0; l < W; ++l) if (y2[l] > R(SMALL)) {
+                const R half = wp::sqrt(y2[l]);
+                sine[l] = R(0.5) * wp::sin(half) / half;
+                cosine[l] = wp::cos(half);
             }
-        V q[3] = {sine * w[0], sine * w[1], sine * w[2]};
+        const V q[3] = {sine * w[0], sine * w[1], sine * w[2]};
+        V matrix[3][3];
+        for (int r = 0; r < 3; ++r) for (int c = 0; c < 3; ++c) {
+            const V turn = r == c ? R(2) * cosine * cosine - R(1) : R(2) * cosine * q[(6 - r - c) % 3];
+            matrix[r][c] = R(2) * q[r] * q[c] + (c == (r + 1) % 3 ? -turn : turn);
+        }
         auto turned = [&](const V v[3], V to[3]) {
-            V across[3];
-            cross(q, v, across);
-            const V along = R(2) * dot(q, v), plain = R(2) * cosine * cosine - R(1);
-            for (int r = 0; r < 3; ++r) to[r] = plain * v[r] + R(2) * cosine * across[r] + along * q[r];
+            for (int r = 0; r < 3; ++r) to[r] = matrix[r][0] * v[0] + matrix[r][1] * v[1] + matrix[r][2] * v[2];
         };
         const V length = (R(1) + dot(t, d)) * length_old;
         V t_new[3], e1[3];
         turned(t, t_new);
-        const V unit = inverse_length(t_new);
+        const V unit = R(1.5) - R(0.5) * dot(t_new, t_new);  // 1/length of what differs from 1 by round-off
         for (int r = 0; r < 3; ++r) {
             t_new[r] *= unit;
             y[r] += length * t_new[r];
