@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from warpflag_kernels import banded, correction, elastic, flow, lanes
+from warpflag_kernels import banded, correction, elastic, flow
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, bench, close, dense_system, displacements, flat, spins
 from tests.helpers import (
@@ -242,23 +242,6 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
     digits = max(1.0, (0.1 / h) ** 4) if precision == "float32" else 1.0
     for part in (slice(0, 6), displacements(b), spins(b)):
         assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision, digits)
-
-
-# Of ten flagella in float64: a register of eight lanes, and one of two.
-@pytest.mark.parametrize("values", [UNEQUAL, {**UNEQUAL, "flagella.count": 10}, {"flagella.count": 1}], ids=str)
-def test_flagella_side_by_side_are_those_one_by_one(values, device, precision, monkeypatch):
-    b = bench(values, precision, device)
-    right = np.random.default_rng(5).uniform(-1, 1, (b.count, 4))
-    found = {}
-    for together in (False, True):
-        monkeypatch.setattr(lanes, "side_by_side", lambda model, together=together: together and model.device.is_cpu)
-        band, y = b.factorise(1e-5, 0.9), b.increment(1.0, right)
-        banded.solve(b.model, b.state, band, y)
-        found[together] = [a.numpy().copy() for a in (band.body_columns, band.body_block, band.body_inverse)]
-        found[together].append(flat(y))
-    for together, one_by_one in zip(found[False], found[True], strict=True):
-        assert np.abs(together).max() > 0
-        assert close(one_by_one, together, precision)
 
 
 @pytest.mark.parametrize("mode", ["all", "between"])

@@ -1,7 +1,7 @@
 """Block Cholesky factors of the band of one flagellum, and solutions with them: a thread to a flagellum or a column.
 
 Row i has the blocks `diagonal`, to itself, `lower1`, to row i - 1, and `lower2`, to row i - 2. Their factors take their
-place: C_ii^-1, C_(i,i-1), C_(i,i-2). `lanes` is the same for several flagella at once.
+place: C_ii^-1, C_(i,i-1), C_(i,i-2). `band_lanes` does the same for several flagella at once.
 """
 
 import functools
