@@ -84,8 +84,8 @@ _SOLVE = """
                 for (int m = 0; m < MANY; ++m) { p[c][m] += f1 * y[r][m]; q[c][m] += f2 * y[r][m]; }
             }
             for (int l = 0; l < W; ++l) if (i <= last[l]) {
-                R* to = (R*)x.data + 4 * COLUMNS * (node[l] + i) + column;
-                for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) to[COLUMNS * r + m] = y[r][m][l];
+                R* to = (R*)(x.data + COLUMNS * (node[l] + i) + column);
+                for (int m = 0; m < MANY; ++m) for (int r = 0; r < 4; ++r) to[4 * m + r] = y[r][m][l];
             }
         }
     }
@@ -214,7 +214,7 @@ def functions(p: Precision) -> SimpleNamespace:
         first_node: wp.array(dtype=wp.int32),
         weight: real,
         to_body: wp.array(dtype=mat46),
-        x: wp.array(dtype=mat46),
+        x: wp.array(dtype=vec4),
     ): ...
 
     return SimpleNamespace(factorise=factorise, solve=solve, columns=columns)

@@ -43,7 +43,7 @@ def types(p: Precision) -> SimpleNamespace:
         to_body: wp.array(dtype=mat46)  # [K * 3]: H_fb of elements 0, 1, 2
         from_body: wp.array(dtype=mat46)  # [K * 3]: H_bf^T; differs without the bearing torque
         body_block: wp.array(dtype=mat66)  # [K]: the flagellum's share of H_bb - H_bf W
-        body_columns: wp.array(dtype=mat46)  # [E]: W
+        body_columns: wp.array(dtype=p.vec4)  # [E * 6]: W, column after column of an element
         body_inverse: wp.array(dtype=mat66)  # [C]: S^-1
         singular: wp.array(dtype=wp.int32)  # [C], 1: a pivot was not positive
         # Flagella side by side.
@@ -56,7 +56,7 @@ def types(p: Precision) -> SimpleNamespace:
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions of the band: the body's mobility, and the solution along one flagellum."""
-    vec3, vec6 = p.vec3, types(p).vec6
+    vec3, vec4, vec6 = p.vec3, p.vec4, types(p).vec6
     Model, State, Band, Increment = structs(p).Model, structs(p).State, types(p).Band, chain.types(p).Increment
     solve, solve_group = cholesky.functions(p).solve, band_lanes.functions(p).solve
 
@@ -83,7 +83,16 @@ def functions(p: Precision) -> SimpleNamespace:
             solve_group(band.groups, band.factors, g, model.first_node, x.node)
             g += 1
 
-    return SimpleNamespace(body_mobility=body_mobility, solve_flagellum=solve_flagellum, solve_cell=solve_cell)
+    @wp.func(module=p.module("banded_functions"))
+    def follow(band: Band, e: wp.int32, y: vec4, body: vec6):
+        """Element e of a solution, from the one with the body at rest and the increment of the body."""
+        for column in range(6):
+            y -= body[column] * band.body_columns[6 * e + column]
+        return y
+
+    return SimpleNamespace(
+        body_mobility=body_mobility, solve_flagellum=solve_flagellum, solve_cell=solve_cell, follow=follow
+    )
 
 
 @functools.cache
@@ -95,7 +104,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     body_mobility, solve_flagellum = functions(p).body_mobility, functions(p).solve_flagellum
     factorise_along, solve_column = cholesky.functions(p).factorise, cholesky.functions(p).solve_column
-    column_of, of_group = cholesky.functions(p).column_of, band_lanes.functions(p)
+    follow, of_group = functions(p).follow, band_lanes.functions(p)
     factorise_group, solve_columns, solve_group = of_group.factorise, of_group.columns, of_group.solve
     module = p.module("banded", "bearing" if bearing_torque else "")
 
@@ -270,6 +279,16 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
                 band.diagonal, band.lower1, band.lower2, band.singular, c,
             )  # fmt: skip
 
+    @wp.func(module=module)
+    def take_share(model: Model, band: Band, k: wp.int32, column: wp.int32):
+        """The share of flagellum k in a column of H_bf W."""
+        first = model.first_node[k]
+        shared = vec6(real(0.0))
+        for j in range(3):
+            shared += wp.transpose(band.from_body[3 * k + j]) * band.body_columns[6 * (first + j) + column]
+        for row in range(6):
+            band.body_block[k][row, column] -= shared[row]
+
     @wp.kernel(module=module)
     def body_columns(
         # Model:
@@ -291,12 +310,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         solve_column(
             first, end, band.diagonal, band.lower1, band.lower2, s, band.to_body, 3 * k, column, band.body_columns
         )
-        # The flagellum's share of H_bb - H_bf W.
-        shared = vec6(real(0.0))
-        for j in range(3):
-            shared += wp.transpose(band.from_body[3 * k + j]) * column_of(band.body_columns, first + j, column)
-        for row in range(6):
-            band.body_block[k][row, column] -= shared[row]
+        take_share(model, band, k, column)
 
     @wp.kernel(module=module)
     def body_columns_of_groups(
@@ -317,11 +331,8 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
             band.groups, band.factors, g, model.first_node, real(band.weight[c]), band.to_body, band.body_columns
         )
         while k < end:
-            first = model.first_node[k]
-            shared = band.body_block[k]
-            for j in range(3):
-                shared -= wp.transpose(band.from_body[3 * k + j]) * band.body_columns[first + j]
-            band.body_block[k] = shared
+            for column in range(6):
+                take_share(model, band, k, column)
             k += 1
 
     @wp.func(module=module)
@@ -466,7 +477,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0:
-            x.node[e] = x.node[e] - band.body_columns[e] * x.body[c]
+            x.node[e] = follow(band, e, x.node[e], x.body[c])
 
     return SimpleNamespace(
         solve_flagella=solve_flagella,

@@ -141,11 +141,6 @@ def functions(p: Precision) -> SimpleNamespace:
         )
 
     @wp.func(module=module)
-    def set_column(blocks: wp.array(dtype=mat46), i: wp.int32, column: wp.int32, y: vec4):
-        for row in range(4):
-            blocks[i][row, column] = y[row]
-
-    @wp.func(module=module)
     def solve_column(
         first: wp.int32,
         end: wp.int32,
@@ -156,7 +151,7 @@ def functions(p: Precision) -> SimpleNamespace:
         right: wp.array(dtype=mat46),
         at: wp.int32,
         column: wp.int32,
-        x: wp.array(dtype=mat46),
+        x: wp.array(dtype=vec4),
     ):
         """The solution for one column, which has right-hand sides in the first three rows alone: from right[at] on.
 
@@ -174,7 +169,7 @@ def functions(p: Precision) -> SimpleNamespace:
             if i > first + 1:
                 y -= lower2[i] * y2
             y = diagonal[i] * y
-            set_column(x, i, column, y)
+            x[6 * i + column] = y
             y2 = y1
             y1 = y
             i += 1
@@ -182,15 +177,15 @@ def functions(p: Precision) -> SimpleNamespace:
         y2 = vec4(real(0.0))
         i = end - 1
         while i >= first:
-            y = column_of(x, i, column)
+            y = x[6 * i + column]
             if i + 1 < end:
                 y -= wp.transpose(lower1[i + 1]) * y1
             if i + 2 < end:
                 y -= wp.transpose(lower2[i + 2]) * y2
             y = wp.transpose(diagonal[i]) * y
-            set_column(x, i, column, y)
+            x[6 * i + column] = y
             y2 = y1
             y1 = y
             i -= 1
 
-    return SimpleNamespace(factorise=factorise, solve=solve, column_of=column_of, solve_column=solve_column)
+    return SimpleNamespace(factorise=factorise, solve=solve, solve_column=solve_column)

@@ -74,7 +74,8 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
     load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
     band_functions = banded.functions(p)
     body_mobility, solve_flagellum = band_functions.body_mobility, band_functions.solve_flagellum
-    solve_cell, side_by_side = band_functions.solve_cell, lanes == 1 and not p.strict
+    solve_cell, follow = band_functions.solve_cell, band_functions.follow
+    side_by_side = lanes == 1 and not p.strict
     lever = contacts.functions(p)
     gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
     module = p.module("compliance", f"{pairs}_{form}_{lanes}")
@@ -191,7 +192,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         body = law.answer.body[c]
         e = begin + lane
         while e < end:
-            law.answer.node[e] = law.answer.node[e] - band.body_columns[e] * body
+            law.answer.node[e] = follow(band, e, law.answer.node[e], body)
             e += lanes
         meet()
         i = contacts_in.first[c] + lane
