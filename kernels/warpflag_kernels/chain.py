@@ -170,6 +170,7 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
     @wp.kernel(module=module)
     def retract_groups(
         # Model:
+        groups: Groups,
         model: Model,
         # State:
         state: State,
@@ -182,8 +183,6 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         end: Pose,
         a_out: Increment,
         b_out: Increment,
-        # Model:
-        groups: Groups,
     ):
         g = wp.tid()
         k = groups.first[g]
@@ -230,7 +229,7 @@ def retract(
     wp.launch(kernels.retract_bodies, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, start, scale, x, a, b, end, a_out, b_out]
     if lanes.side_by_side(model):
-        inputs.append(model.groups)
-        wp.launch(kernels.retract_groups, len(model.groups.first), inputs=inputs, device=model.device)
+        groups = model.groups
+        wp.launch(kernels.retract_groups, len(groups.first), inputs=[groups, *inputs], device=model.device)
     else:
         wp.launch(kernels.retract_flagella, model.flagellum_count, inputs=inputs, device=model.device)

@@ -25,6 +25,7 @@ from warpflag_kernels import (
     guard,
     hessian,
     implicit,
+    lanes,
     mobility,
     stability,
 )
@@ -110,7 +111,9 @@ class ImplicitStepper:
         b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
         b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(6 * elements, p.vec4)
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
-        b.groups, b.factors = model.groups, band_lanes.build(p, model.groups)
+        b.groups = model.groups
+        if lanes.side_by_side(model):
+            b.factors = band_lanes.build(p, model.groups)
         self._band = b
 
         self._contacts, self._law = self._contact_arrays()
