@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels import banded
 from warpflag_kernels.types import DeviceModel
 
 from tests.helpers import cell
@@ -59,7 +58,6 @@ def launched(
         if not by_cells:
             patch.setattr(DeviceModel, "one_thread_per_cell", False)
             patch.setattr(DeviceModel, "threads_cooperate", True)
-            patch.setattr(banded, "columns_apart", lambda model: True)
         sim = Simulation(scene, device="cpu")
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:

@@ -244,18 +244,6 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
         assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision, digits)
 
 
-def test_columns_of_the_body_one_by_one_are_those_all_at_once(device, precision, monkeypatch):
-    b = bench(UNEQUAL, precision, device)
-    found = {}
-    for apart in (False, True):
-        monkeypatch.setattr(banded, "columns_apart", lambda model, apart=apart: apart)
-        band = b.factorise(1e-5, 0.9)
-        found[apart] = [a.numpy().copy() for a in (band.body_columns, band.body_block, band.body_inverse)]
-    for together, one_by_one in zip(found[False], found[True], strict=True):
-        assert np.abs(together).max() > 0
-        assert close(one_by_one, together, precision)
-
-
 @pytest.mark.parametrize("mode", ["all", "between"])
 def test_corrections_lead_to_the_solution_with_the_full_mobility(mode, device, precision):
     """(1/dt + g M H) e = v without contact, whatever the weight in the matrix."""

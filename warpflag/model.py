@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels import chart as chart_stage
 from warpflag_kernels import control as control_stage
-from warpflag_kernels import guard, mobility, neighbours
+from warpflag_kernels import guard, lanes, mobility, neighbours
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, Switches, structs
 
 from warpflag.drag import filament_mobility, pair_radius, spheroid_mobility
@@ -108,6 +108,7 @@ def build_model(scenes: Sequence[Scene], device: Any, precision: Precision) -> D
         element_count=len(flagellum_of),
         largest_cell=int(np.bincount(owner, nodes - 1).max()),
         data=m,
+        groups=lanes.build(p, m.first_flagellum.numpy(), m.first_node.numpy(), device),
     )
 
 

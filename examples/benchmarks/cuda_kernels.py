@@ -32,7 +32,6 @@ import warpflag_kernels
 from cells import spread
 from cubin import Usage, usage
 from harness import table
-from warpflag_kernels import banded
 from warpflag_kernels.types import DeviceModel
 
 from warpflag.scene import with_values
@@ -46,18 +45,17 @@ def collected() -> Iterator[set[Any]]:
     """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
-    by_cells, by_warps, apart = DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate, banded.columns_apart
+    by_cells, together = DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
         DeviceModel.one_thread_per_cell = False  # which is for a CPU
         DeviceModel.threads_cooperate = True
-        banded.columns_apart = lambda _model: True
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
-        DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate, banded.columns_apart = by_cells, by_warps, apart
+        DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate = by_cells, together
 
 
 def launched(precision: str, stepper: str) -> set[Any]:

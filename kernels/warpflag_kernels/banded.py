@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import chain, hessian
+from warpflag_kernels import band_lanes, chain, cholesky, hessian, lanes
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
@@ -28,13 +28,14 @@ def types(p: Precision) -> SimpleNamespace:
     mat44 = wp.types.matrix((4, 4), real)
     mat46 = wp.types.matrix((4, 6), real)
     mat66 = wp.types.matrix((6, 6), real)
+    Groups, Factors = lanes.struct(), band_lanes.struct(p)
 
     @wp.struct
     class Band:
         # Per cell [C], set by the stepper.
         step: wp.array(dtype=wp.float64)  # dt [s]
         weight: wp.array(dtype=wp.float64)  # s
-        # Blocks of row i [E]: to i, i - 1, i - 2; replaced by C_ii^-1, C_(i,i-1), C_(i,i-2).
+        # Blocks of row i [E]: to i, i - 1, i - 2; replaced by C_ii^-1, C_(i,i-1), C_(i,i-2) unless in `factors`.
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
@@ -42,9 +43,12 @@ def types(p: Precision) -> SimpleNamespace:
         to_body: wp.array(dtype=mat46)  # [K * 3]: H_fb of elements 0, 1, 2
         from_body: wp.array(dtype=mat46)  # [K * 3]: H_bf^T; differs without the bearing torque
         body_block: wp.array(dtype=mat66)  # [K]: the flagellum's share of H_bb - H_bf W
-        body_columns: wp.array(dtype=mat46)  # [E]: W
+        body_columns: wp.array(dtype=p.vec4)  # [E * 6]: W, column after column of an element
         body_inverse: wp.array(dtype=mat66)  # [C]: S^-1
         singular: wp.array(dtype=wp.int32)  # [C], 1: a pivot was not positive
+        # Flagella side by side.
+        groups: Groups
+        factors: Factors
 
     return SimpleNamespace(mat44=mat44, mat46=mat46, mat66=mat66, vec6=wp.types.vector(6, real), Band=Band)
 
@@ -52,8 +56,9 @@ def types(p: Precision) -> SimpleNamespace:
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions of the band: the body's mobility, and the solution along one flagellum."""
-    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, types(p).vec6
+    vec3, vec4, vec6 = p.vec3, p.vec4, types(p).vec6
     Model, State, Band, Increment = structs(p).Model, structs(p).State, types(p).Band, chain.types(p).Increment
+    solve, solve_group = cholesky.functions(p).solve, band_lanes.functions(p).solve
 
     @wp.func(module=p.module("banded_functions"))
     def body_mobility(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
@@ -68,50 +73,40 @@ def functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=p.module("banded_functions"))
     def solve_flagellum(model: Model, band: Band, k: wp.int32, x: Increment):
         """Solves with the factors of flagellum k, the body at rest; in place."""
-        first = model.first_node[k]
-        end = model.first_node[k + 1]
-        y1 = vec4(real(0.0))
-        y2 = vec4(real(0.0))
-        i = first
-        while i < end:
-            y = x.node[i]
-            if i > first:
-                y -= band.lower1[i] * y1
-            if i > first + 1:
-                y -= band.lower2[i] * y2
-            y = band.diagonal[i] * y
-            x.node[i] = y
-            y2 = y1
-            y1 = y
-            i += 1
-        y1 = vec4(real(0.0))
-        y2 = vec4(real(0.0))
-        i = end - 1
-        while i >= first:
-            y = x.node[i]
-            if i + 1 < end:
-                y -= wp.transpose(band.lower1[i + 1]) * y1
-            if i + 2 < end:
-                y -= wp.transpose(band.lower2[i + 2]) * y2
-            y = wp.transpose(band.diagonal[i]) * y
-            x.node[i] = y
-            y2 = y1
-            y1 = y
-            i -= 1
+        solve(model.first_node[k], model.first_node[k + 1], band.diagonal, band.lower1, band.lower2, x.node)
 
-    return SimpleNamespace(body_mobility=body_mobility, solve_flagellum=solve_flagellum)
+    @wp.func(module=p.module("banded_functions"))
+    def solve_cell(model: Model, band: Band, c: wp.int32, x: Increment):
+        """The same for every flagellum of cell c, side by side."""
+        g = band.groups.first_group[c]
+        while g < band.groups.first_group[c + 1]:
+            solve_group(band.groups, band.factors, g, model.first_node, x.node)
+            g += 1
+
+    @wp.func(module=p.module("banded_functions"))
+    def follow(band: Band, e: wp.int32, y: vec4, body: vec6):
+        """Element e of a solution, from the one with the body at rest and the increment of the body."""
+        for column in range(6):
+            y -= body[column] * band.body_columns[6 * e + column]
+        return y
+
+    return SimpleNamespace(
+        body_mobility=body_mobility, solve_flagellum=solve_flagellum, solve_cell=solve_cell, follow=follow
+    )
 
 
 @functools.cache
-def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace:
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
+def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
     Increment = chain.types(p).Increment
     t = types(p)
     mat44, mat46, mat66, vec6, Band = t.mat44, t.mat46, t.mat66, t.vec6, t.Band
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     body_mobility, solve_flagellum = functions(p).body_mobility, functions(p).solve_flagellum
-    columns = vec4 if apart else mat46
-    module = p.module("banded", ("bearing" if bearing_torque else "") + ("_apart" if apart else ""))
+    factorise_along, solve_column = cholesky.functions(p).factorise, cholesky.functions(p).solve_column
+    follow, of_group = functions(p).follow, band_lanes.functions(p)
+    factorise_group, solve_columns, solve_group = of_group.factorise, of_group.columns, of_group.solve
+    module = p.module("banded", "bearing" if bearing_torque else "")
 
     @wp.func(module=module)
     def block(xx: p.mat33, x_spin: vec3, spin_x: vec3, spin: real):
@@ -249,39 +244,6 @@ def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace
         band.from_body[3 * k + 2] = to2
         band.body_block[k] = shared
 
-    @wp.func(module=module)
-    def inverse_cholesky(a: mat44):
-        """Inverse of the lower Cholesky factor; all zero where a pivot is not positive."""
-        zero, one = real(0.0), real(1.0)
-        p0 = a[0, 0]
-        i0 = one / wp.sqrt(p0)
-        c10 = a[1, 0] * i0
-        c20 = a[2, 0] * i0
-        c30 = a[3, 0] * i0
-        p1 = a[1, 1] - c10 * c10
-        i1 = one / wp.sqrt(p1)
-        c21 = (a[2, 1] - c20 * c10) * i1
-        c31 = (a[3, 1] - c30 * c10) * i1
-        p2 = a[2, 2] - c20 * c20 - c21 * c21
-        i2 = one / wp.sqrt(p2)
-        c32 = (a[3, 2] - c30 * c20 - c31 * c21) * i2
-        p3 = a[3, 3] - c30 * c30 - c31 * c31 - c32 * c32
-        i3 = one / wp.sqrt(p3)
-        if not (p0 > zero and p1 > zero and p2 > zero and p3 > zero):  # NaN fails this, too
-            return mat44(zero)
-        x10 = -c10 * i0 * i1
-        x21 = -c21 * i1 * i2
-        x32 = -c32 * i2 * i3
-        x20 = -(c20 * i0 + c21 * x10) * i2
-        x31 = -(c31 * i1 + c32 * x21) * i3
-        x30 = -(c30 * i0 + c31 * x10 + c32 * x20) * i3
-        return mat44(
-            i0, zero, zero, zero,
-            x10, i1, zero, zero,
-            x20, x21, i2, zero,
-            x30, x31, x32, i3,
-        )  # fmt: skip
-
     @wp.kernel(module=module)
     def factorise(
         # Model:
@@ -297,55 +259,35 @@ def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace
         c = model.cell_of[first]
         if state.active[c] == 0:
             return
-        c1_before = mat44(real(0.0))  # C_(i-1,i-2)
-        inverse1 = mat44(real(0.0))
-        inverse2 = mat44(real(0.0))
-        i = first
-        while i < end:
-            d = band.diagonal[i]
-            c1 = mat44(real(0.0))
-            if i > first:
-                c1 = band.lower1[i]
-                if i > first + 1:
-                    c2 = band.lower2[i] * wp.transpose(inverse2)
-                    c1 -= c2 * wp.transpose(c1_before)
-                    d -= c2 * wp.transpose(c2)
-                    band.lower2[i] = c2
-                c1 = c1 * wp.transpose(inverse1)
-                d -= c1 * wp.transpose(c1)
-                band.lower1[i] = c1
-            inverse2 = inverse1
-            inverse1 = inverse_cholesky(d)
-            if inverse1[0, 0] == real(0.0):
-                band.singular[c] = 1
-            band.diagonal[i] = inverse1
-            c1_before = c1
-            i += 1
+        if not factorise_along(first, end, band.diagonal, band.lower1, band.lower2):
+            band.singular[c] = 1
 
-    # An index that is only known at run time would put a loaded block on the stack, in Warp's own words.
-    @wp.func_native("return blocks.data[i].data[row][column];")
-    def component(blocks: wp.array(dtype=mat46), i: wp.int32, row: wp.int32, column: wp.int32) -> real: ...
+    @wp.kernel(module=module)
+    def factorise_groups(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        band: Band,
+    ):
+        g = wp.tid()
+        c = model.cell_of[model.first_node[band.groups.first[g]]]
+        if state.active[c] != 0:
+            factorise_group(
+                band.groups, band.factors, g, model.first_node,
+                band.diagonal, band.lower1, band.lower2, band.singular, c,
+            )  # fmt: skip
 
     @wp.func(module=module)
-    def own_columns(blocks: wp.array(dtype=mat46), i: wp.int32, column: wp.int32):
-        """What a thread that begins at this column handles of block i."""
-        if wp.static(apart):
-            return vec4(
-                component(blocks, i, 0, column),
-                component(blocks, i, 1, column),
-                component(blocks, i, 2, column),
-                component(blocks, i, 3, column),
-            )
-        else:
-            return blocks[i]
-
-    @wp.func(module=module)
-    def set_own_columns(blocks: wp.array(dtype=mat46), i: wp.int32, column: wp.int32, y: columns):
-        if wp.static(apart):
-            for row in range(4):
-                blocks[i][row, column] = y[row]
-        else:
-            blocks[i] = y
+    def take_share(model: Model, band: Band, k: wp.int32, column: wp.int32):
+        """The share of flagellum k in a column of H_bf W."""
+        first = model.first_node[k]
+        shared = vec6(real(0.0))
+        for j in range(3):
+            shared += wp.transpose(band.from_body[3 * k + j]) * band.body_columns[6 * (first + j) + column]
+        for row in range(6):
+            band.body_block[k][row, column] -= shared[row]
 
     @wp.kernel(module=module)
     def body_columns(
@@ -357,53 +299,41 @@ def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace
         band: Band,
     ):
         thread = wp.tid()
-        k = thread / wp.static(6 if apart else 1)
-        column = thread % wp.static(6 if apart else 1)
+        k = thread / 6
+        column = thread % 6
         first = model.first_node[k]
         end = model.first_node[k + 1]
         c = model.cell_of[first]
         if state.active[c] == 0:
             return
         s = real(band.weight[c])
-        y1 = columns(real(0.0))
-        y2 = columns(real(0.0))
-        i = first
-        while i < end:
-            y = columns(real(0.0))
-            if i < first + 3:
-                y = s * own_columns(band.to_body, 3 * k + i - first, column)
-            if i > first:
-                y -= band.lower1[i] * y1
-            if i > first + 1:
-                y -= band.lower2[i] * y2
-            y = band.diagonal[i] * y
-            set_own_columns(band.body_columns, i, column, y)
-            y2 = y1
-            y1 = y
-            i += 1
-        y1 = columns(real(0.0))
-        y2 = columns(real(0.0))
-        i = end - 1
-        while i >= first:
-            y = own_columns(band.body_columns, i, column)
-            if i + 1 < end:
-                y -= wp.transpose(band.lower1[i + 1]) * y1
-            if i + 2 < end:
-                y -= wp.transpose(band.lower2[i + 2]) * y2
-            y = wp.transpose(band.diagonal[i]) * y
-            set_own_columns(band.body_columns, i, column, y)
-            y2 = y1
-            y1 = y
-            i -= 1
-        # The flagellum's share of H_bb - H_bf W.
-        shared = wp.transpose(band.from_body[3 * k]) * own_columns(band.body_columns, first, column)
-        shared += wp.transpose(band.from_body[3 * k + 1]) * own_columns(band.body_columns, first + 1, column)
-        shared += wp.transpose(band.from_body[3 * k + 2]) * own_columns(band.body_columns, first + 2, column)
-        if wp.static(apart):
-            for row in range(6):
-                band.body_block[k][row, column] -= shared[row]
-        else:
-            band.body_block[k] -= shared
+        solve_column(
+            first, end, band.diagonal, band.lower1, band.lower2, s, band.to_body, 3 * k, column, band.body_columns
+        )
+        take_share(model, band, k, column)
+
+    @wp.kernel(module=module)
+    def body_columns_of_groups(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        band: Band,
+    ):
+        g = wp.tid()
+        k = band.groups.first[g]
+        end = k + band.groups.count[g]
+        c = model.cell_of[model.first_node[k]]
+        if state.active[c] == 0:
+            return
+        solve_columns(
+            band.groups, band.factors, g, model.first_node, real(band.weight[c]), band.to_body, band.body_columns
+        )
+        while k < end:
+            for column in range(6):
+                take_share(model, band, k, column)
+            k += 1
 
     @wp.func(module=module)
     def inverse6(a: mat66):
@@ -497,6 +427,20 @@ def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace
             solve_flagellum(model, band, k, x)
 
     @wp.kernel(module=module)
+    def solve_groups(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        band: Band,
+        # Out:
+        x: Increment,
+    ):
+        g = wp.tid()
+        if state.active[model.cell_of[model.first_node[band.groups.first[g]]]] != 0:
+            solve_group(band.groups, band.factors, g, model.first_node, x.node)
+
+    @wp.kernel(module=module)
     def solve_bodies(
         # Model:
         model: Model,
@@ -533,39 +477,41 @@ def _kernels(p: Precision, bearing_torque: bool, apart: bool) -> SimpleNamespace
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0:
-            x.node[e] = x.node[e] - band.body_columns[e] * x.body[c]
+            x.node[e] = follow(band, e, x.node[e], x.body[c])
 
     return SimpleNamespace(
         solve_flagella=solve_flagella,
+        solve_groups=solve_groups,
         solve_bodies=solve_bodies,
         follow_bodies=follow_bodies,
         assemble=assemble,
         couple_body=couple_body,
         factorise=factorise,
+        factorise_groups=factorise_groups,
         body_columns=body_columns,
+        body_columns_of_groups=body_columns_of_groups,
         factorise_bodies=factorise_bodies,
     )
 
 
-def columns_apart(model: DeviceModel) -> bool:
-    """Whether each of the body's six columns has a thread: all in one fill the registers of a GPU beyond the brim."""
-    return not model.device.is_cpu
-
-
 def _kernels_for(model: DeviceModel) -> SimpleNamespace:
-    return _kernels(model.precision, model.switches.bearing_torque, columns_apart(model))
+    return _kernels(model.precision, model.switches.bearing_torque)
 
 
 def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any) -> None:
     """Assembles and factorises the system of every flagellum and body; `singular` tells of a failed pivot."""
-    kernels, apart = _kernels_for(model), columns_apart(model)
-    device = model.device
+    kernels, device = _kernels_for(model), model.device
     inputs = [model.data, state.data, stiffness, band]
     wp.launch(kernels.assemble, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.couple_body, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band]
-    wp.launch(kernels.factorise, model.flagellum_count, inputs=inputs, device=device)
-    wp.launch(kernels.body_columns, model.flagellum_count * (6 if apart else 1), inputs=inputs, device=device)
+    if model.one_thread_per_cell:
+        groups = len(band.groups.first)
+        wp.launch(kernels.factorise_groups, groups, inputs=inputs, device=device)
+        wp.launch(kernels.body_columns_of_groups, groups, inputs=inputs, device=device)
+    else:
+        wp.launch(kernels.factorise, model.flagellum_count, inputs=inputs, device=device)
+        wp.launch(kernels.body_columns, model.flagellum_count * 6, inputs=inputs, device=device)
     wp.launch(kernels.factorise_bodies, model.cell_count, inputs=inputs, device=device)
 
 
@@ -573,6 +519,9 @@ def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
     """P: from D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place."""
     kernels = _kernels_for(model)
     inputs, device = [model.data, state.data, band, x], model.device
-    wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)
+    if model.one_thread_per_cell:
+        wp.launch(kernels.solve_groups, len(band.groups.first), inputs=inputs, device=device)
+    else:
+        wp.launch(kernels.solve_flagella, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.solve_bodies, model.cell_count, inputs=inputs, device=device)
     wp.launch(kernels.follow_bodies, model.element_count, inputs=inputs, device=device)

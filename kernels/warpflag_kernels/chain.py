@@ -12,7 +12,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import frames
+from warpflag_kernels import chain_lanes, frames, lanes
 from warpflag_kernels.types import DeviceModel, Precision, structs
 
 
@@ -49,6 +49,7 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
     f, fd = frames.functions(p), frames.functions(Precision("float64", p.strict))
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     rotation_vector_quat, rotation_vector_quatd = f.rotation_vector_quat, fd.rotation_vector_quat
+    Groups, chain_rows = lanes.struct(), chain_lanes.rows(p, carrying, Model, Pose, Increment)
     module = p.module("chain", "carrying" if carrying else "")
 
     @wp.func(module=module)
@@ -84,6 +85,20 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         end.body_orientation[c] = orientation
         end.body_axis[c] = vec3(wp.quat_rotate(orientation, wp.vec3d(0.0, 0.0, 1.0)))
 
+    @wp.func(module=module)
+    def retract_tripod(model: Model, start: Pose, s: real, x: Increment, k: wp.int32, c: wp.int32, end: Pose):
+        """The first element of flagellum k; returns where its anchor is."""
+        first = model.first_node[k]
+        orientation = end.body_orientation[c]
+        y = vec3(wp.quat_rotate(orientation, wp.vec3d(model.anchor[k])))
+        m = vec3(wp.quat_rotate(orientation, wp.vec3d(model.motor_axis[k])))
+        director = turn(transport(start.director[first], start.tangent[first], m), m, s * x.node[first][3])
+        end.position[first] = y
+        end.tangent[first] = m
+        end.director[first] = perpendicular_unit(director, m)
+        end.length[first] = real(1.0)
+        return y
+
     @wp.kernel(module=module)
     def retract_flagella(
         # Model:
@@ -106,16 +121,8 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         s = real(scale[c])
-        orientation = end.body_orientation[c]
         y_old = start.position[first]
-        m_old = start.tangent[first]
-        y = vec3(wp.quat_rotate(orientation, wp.vec3d(model.anchor[k])))
-        m = vec3(wp.quat_rotate(orientation, wp.vec3d(model.motor_axis[k])))
-        director = turn(transport(start.director[first], m_old, m), m, s * x.node[first][3])
-        end.position[first] = y
-        end.tangent[first] = m
-        end.director[first] = perpendicular_unit(director, m)
-        end.length[first] = real(1.0)
+        y = retract_tripod(model, start, s, x, k, c, end)
         x_before = s * anchor_part(x.body[c], y_old)
         a_before = vec3(real(0.0))
         b_before = vec3(real(0.0))
@@ -160,7 +167,45 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
 
-    return SimpleNamespace(retract_bodies=retract_bodies, retract_flagella=retract_flagella)
+    @wp.kernel(module=module)
+    def retract_groups(
+        # Model:
+        groups: Groups,
+        model: Model,
+        # State:
+        state: State,
+        start: Pose,
+        scale: wp.array(dtype=wp.float64),
+        x: Increment,
+        a: Increment,
+        b: Increment,
+        # Out:
+        end: Pose,
+        a_out: Increment,
+        b_out: Increment,
+    ):
+        g = wp.tid()
+        k = groups.first[g]
+        c = model.cell_of[model.first_node[k]]
+        if state.active[c] == 0:
+            return
+        s = real(scale[c])
+        chain_rows(groups, g, model.first_node, c, model, start, s, x, a, b, end, a_out, b_out)
+        k_end = k + groups.count[g]
+        if wp.static(carrying) and k == model.first_flagellum[c]:
+            a_out.body[c] = a.body[c]
+            b_out.body[c] = b.body[c]
+        while k < k_end:
+            retract_tripod(model, start, s, x, k, c, end)
+            if wp.static(carrying):
+                first = model.first_node[k]
+                a_out.node[first] = a.node[first]
+                b_out.node[first] = b.node[first]
+            k += 1
+
+    return SimpleNamespace(
+        retract_bodies=retract_bodies, retract_flagella=retract_flagella, retract_groups=retract_groups
+    )
 
 
 def retract(
@@ -183,4 +228,8 @@ def retract(
     inputs = [model.data, state.data, start, scale, x, end]
     wp.launch(kernels.retract_bodies, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, start, scale, x, a, b, end, a_out, b_out]
-    wp.launch(kernels.retract_flagella, model.flagellum_count, inputs=inputs, device=model.device)
+    if model.one_thread_per_cell:
+        groups = model.groups
+        wp.launch(kernels.retract_groups, len(groups.first), inputs=[groups, *inputs], device=model.device)
+    else:
+        wp.launch(kernels.retract_flagella, model.flagellum_count, inputs=inputs, device=model.device)

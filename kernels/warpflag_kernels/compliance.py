@@ -72,7 +72,10 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
     Flow, vec6 = flow_stage.struct(p), chain.types(p).vec6
     flows = flow_stage.functions(p, pairs, form)
     load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
-    body_mobility, solve_flagellum = banded.functions(p).body_mobility, banded.functions(p).solve_flagellum
+    band_functions = banded.functions(p)
+    body_mobility, solve_flagellum = band_functions.body_mobility, band_functions.solve_flagellum
+    solve_cell, follow = band_functions.solve_cell, band_functions.follow
+    side_by_side = lanes == 1 and not p.strict
     lever = contacts.functions(p)
     gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
     module = p.module("compliance", f"{pairs}_{form}_{lanes}")
@@ -160,10 +163,13 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
             e += lanes
         meet()
         weight = real(band.weight[c])
+        if wp.static(side_by_side):
+            solve_cell(model, band, c, law.answer)
         k = k_begin + lane
         while k < k_end:
             first = model.first_node[k]
-            solve_flagellum(model, band, k, law.answer)
+            if wp.static(not side_by_side):
+                solve_flagellum(model, band, k, law.answer)
             back = vec6(real(0.0))
             for j in range(3):
                 back += wp.transpose(band.from_body[3 * k + j]) * law.answer.node[first + j]
@@ -186,7 +192,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         body = law.answer.body[c]
         e = begin + lane
         while e < end:
-            law.answer.node[e] = law.answer.node[e] - band.body_columns[e] * body
+            law.answer.node[e] = follow(band, e, law.answer.node[e], body)
             e += lanes
         meet()
         i = contacts_in.first[c] + lane

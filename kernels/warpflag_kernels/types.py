@@ -197,6 +197,7 @@ class DeviceModel:
 
     Attributes:
         data: the struct `Model` of this precision.
+        groups: the struct `Groups`: flagella that a CPU takes side by side.
         cell_count, flagellum_count, element_count: sizes C, K, E.
         largest_cell: moving nodes of the largest cell.
     """
@@ -209,6 +210,7 @@ class DeviceModel:
     element_count: int
     largest_cell: int
     data: Any
+    groups: Any
 
     @property
     def pair_precision(self) -> Precision:

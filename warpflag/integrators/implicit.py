@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels import (
+    band_lanes,
     banded,
     body,
     chain,
@@ -107,8 +108,11 @@ class ImplicitStepper:
         b.step, b.weight = zeros(cells, wp.float64), zeros(cells, wp.float64)
         b.diagonal, b.lower1, b.lower2 = (zeros(elements, bt.mat44) for _ in range(3))
         b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
-        b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(elements, bt.mat46)
+        b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(6 * elements, p.vec4)
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
+        b.groups = model.groups
+        if model.one_thread_per_cell:
+            b.factors = band_lanes.build(p, model.groups)
         self._band = b
 
         self._contacts, self._law = self._contact_arrays()
