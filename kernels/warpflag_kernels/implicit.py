@@ -28,8 +28,9 @@ from warpflag_kernels.types import Precision, structs
 
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
-PEAK = 3.8
+PEAK = 4.2
 GAP_SHARE = 0.5  # of the error that a step may make, for what the contact law leaves over
+GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
 
 @functools.cache
@@ -68,7 +69,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     peak = wp.constant(wp.float64(PEAK))
-    finest, gap_share = wp.constant(wp.float64(contact_law.FINEST)), wp.constant(wp.float64(GAP_SHARE))
+    finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_law.FINEST, GAP_SHARE, GAP_GROWTH))
 
     @wp.kernel(module=module)
     def begin(
@@ -102,7 +103,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         law.gain[c] = g
         law.failed[c] = 0
         finest_gap = wp.float64(model.steric_diameter[c]) * finest
-        law.tolerance[c] = real(wp.max(finest_gap, gap_share * steps.tolerance[c] * dt))
+        enough = wp.max(gap_share * steps.tolerance[c] * dt, gap_growth * dt * dt * dt)
+        law.tolerance[c] = real(wp.max(finest_gap, enough))
         contacts_out.overflow[c] = 0
         imp.evaluations[c] += 1
 
