@@ -80,7 +80,7 @@ def functions(p: Precision) -> SimpleNamespace:
                 # What is lost in round-off lowers the mean at most; longer steps will tell. But where round-off hides
                 # all that is allowed, the mean of what was seen holds, until nothing has confirmed it for long.
                 hidden = lost > tolerance * dt
-                if seen or level * control.error_time[c] < control.error_sum[c]:
+                if seen or (not hidden and level * control.error_time[c] < control.error_sum[c]):
                     control.error_sum[c] = fade * control.error_sum[c] + level * dt
                     control.error_time[c] = fade * control.error_time[c] + dt
                 elif hidden:
