@@ -72,9 +72,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
     twist_angle = frames.functions(p).twist_angle
     closest_parameters = steric.functions(p).closest_parameters
     near_by = neighbours.functions(p)
-    candidates, candidate, first_later, beside = (
-        near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
-    )  # fmt: skip
+    candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
+    beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
@@ -181,6 +180,22 @@ def _kernels(p: Precision) -> SimpleNamespace:
             begin = end
         return False
 
+    @wp.func(module=module)
+    def met(state: State, guard: Guard, e: wp.int32, j: wp.int32, moved: real, touch: real):
+        """Whether segments e and j have passed through each other since the last look; no node has moved further."""
+        away = middle(state, e) - middle(state, j)
+        half = real(0.5) * state.length[j]
+        reach = touch + real(2.0) * moved
+        within = real(0.5) * state.length[e] + half + reach
+        return (
+            wp.dot(away, away) < within * within
+            and not beside(away, state.tangent[e], state.tangent[j], half, reach)
+            and crossed(
+                guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j],
+                state.position[e - 1], state.position[e], state.position[j - 1], state.position[j], touch,
+            )
+        )  # fmt: skip
+
     @wp.kernel(module=module)
     def check_crossings(
         # Model:
@@ -201,12 +216,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
         touch = real(0.05) * model.steric_diameter[c]
-        p1 = guard.position[e - 1]
-        q1 = guard.position[e]
-        p1n = state.position[e - 1]
-        q1n = state.position[e]
-        middle = real(0.5) * (p1n + q1n)
-        # What can have met between the two looks stands in the lists, if nothing has moved far.
         moved = real(0.0)
         shifted = real(0.0)
         other = model.first_flagellum[c]
@@ -214,31 +223,26 @@ def _kernels(p: Precision) -> SimpleNamespace:
             moved = wp.max(moved, guard.moved[other])
             shifted = wp.max(shifted, guard.shifted[other])
             other += 1
-        later = model.first_node[k + 1]
-        listed = real(2.0) * (moved + shifted) + touch < contact_reach * model.steric_diameter[c] + skin
-        n = model.first_node[model.first_flagellum[c + 1]] - later
-        i = int(0)
-        if listed:
-            n = candidates(model, near, e)
+        # What can have met between the two looks stands in the lists, if nothing has moved far.
+        if real(2.0) * (moved + shifted) + touch < contact_reach * model.steric_diameter[c] + skin:
             i = first_later(model, near, e)
-        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
-        while i < n:
-            j = later + i
-            if listed:
+            while i < candidates(model, near, e):
                 j = candidate(model, near, e, i)
-            i += 1
-            if j > model.first_node[model.flagellum_of[j]]:
-                p2n = state.position[j - 1]
-                q2n = state.position[j]
-                away = middle - real(0.5) * (p2n + q2n)
-                half = real(0.5) * state.length[j]
-                within = reach + half
-                if (
-                    wp.dot(away, away) < within * within
-                    and not beside(away, state.tangent[e], state.tangent[j], half, touch + real(2.0) * moved)
-                    and crossed(p1, q1, guard.position[j - 1], guard.position[j], p1n, q1n, p2n, q2n, touch)
-                ):
+                i += 1
+                if j >= 0 and met(state, guard, e, j, moved, touch):
                     wp.atomic_min(control.fault, c, crossing + e)
+            return
+        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
+        other = k + 1
+        while other < model.first_flagellum[c + 1]:
+            j = model.first_node[other] + 1
+            end = model.first_node[other + 1]
+            while j < end:
+                if met(state, guard, e, j, moved, touch):
+                    wp.atomic_min(control.fault, c, crossing + e)
+                distance = wp.length(middle(state, e) - middle(state, j))
+                j = next_near(state.length, j, end, distance, reach)
+            other += 1
 
     @wp.kernel(module=module)
     def measure_moves(
