@@ -49,7 +49,7 @@ _SOLVE = """
         ROOM
         V p[4][MANY], q[4][MANY];  // solutions of the last two rows
         for (int r = 0; r < 4; ++r) for (int m = 0; m < MANY; ++m) p[r][m] = q[r][m] = zero;
-        for (int i = (FILLED < rows ? FILLED : rows) - 1; i >= 0; --i) {
+        for (int i = wp::min(FILLED, rows) - 1; i >= 0; --i) {
             const R* block = F + NUMBERS * W * i;
             V b[4][MANY];
             LOAD
