@@ -63,7 +63,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     vecd = wp.types.vector(DIRECTIONS, real)
     hessenberg = wp.types.matrix((DIRECTIONS + 1, DIRECTIONS), real)
     rotations = wp.types.vector(DIRECTIONS + 1, real)
-    steric_force, steric_stiffness = steric.functions(p).steric_force, steric.functions(p).steric_stiffness
+    steric_force, steric_law = steric.functions(p).steric_force, steric.functions(p).steric_law
     gap_change = contacts.functions(p).gap_change
     f = compliance.functions(p, pairs, form, lanes)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
@@ -132,8 +132,8 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         gap = wp.clamp(gap, linear_below * diameter, cutoff * diameter)
         i = int(0)
         while i < 20:
-            f = gap - compliance * steric_force(gap, strength, diameter) - s
-            step = -f / (real(1.0) + compliance * steric_stiffness(gap, strength, diameter))
+            force, stiffness = steric_law(gap, strength, diameter)
+            step = (s + compliance * force - gap) / (real(1.0) + compliance * stiffness)
             gap += step
             if wp.abs(step) < settled * diameter:
                 i = 20
@@ -236,7 +236,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
                 norm = real(0.0)
                 i = begin + lane
                 while i < stop:
-                    k = steric_stiffness(law.solved_gap[i], strength, diameter)
+                    _force, k = steric_law(law.solved_gap[i], strength, diameter)
                     root = wp.sqrt(k / (real(1.0) + k * law.yielding[i]))
                     law.root[i] = root
                     b = -root * law.residual[i]
@@ -322,9 +322,8 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
                         m += 1
                     gap = law.solved_gap[begin + i]
                     compliance = law.yielding[begin + i]
-                    k = steric_stiffness(gap, strength, diameter)
-                    alone = gap - compliance * steric_force(gap, strength, diameter)
-                    alone += (real(1.0) + compliance * k) * change
+                    force, k = steric_law(gap, strength, diameter)
+                    alone = gap - compliance * force + (real(1.0) + compliance * k) * change
                     change = settle(alone, compliance, strength, diameter, gap + change) - gap
                     # Kept, should the step have to be shortened.
                     law.basis[own_basis + i] = change

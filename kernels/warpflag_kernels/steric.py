@@ -48,17 +48,19 @@ def functions(p: Precision) -> SimpleNamespace:
         return strength * y6 * y * (real(2.0) * y6 - real(1.0))
 
     @wp.func(module=p.module("steric_functions"))
-    def steric_stiffness(r: real, strength: real, diameter: real):
-        """-dF/dr at distance r [pN/um]."""
+    def steric_law(r: real, strength: real, diameter: real):
+        """Repulsion F [pN] and stiffness -dF/dr [pN/um] at distance r."""
         x = r / diameter
         if x >= cutoff:
-            return real(0.0)
+            return real(0.0), real(0.0)
+        stiffness = strength / diameter
         if x < linear_below:
-            return strength / diameter * slope_there
+            return strength * (force_there + slope_there * (linear_below - x)), stiffness * slope_there
         y = real(1.0) / x
         y2 = y * y
         y6 = y2 * y2 * y2
-        return strength / diameter * y6 * y2 * (real(26.0) * y6 - real(7.0))
+        force = strength * y6 * y * (real(2.0) * y6 - real(1.0))
+        return force, stiffness * y6 * y2 * (real(26.0) * y6 - real(7.0))
 
     @wp.func(module=p.module("steric_functions"))
     def closest_parameters(p1: vec3, d1: vec3, p2: vec3, d2: vec3):
@@ -87,7 +89,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     return SimpleNamespace(
         steric_force=steric_force,
-        steric_stiffness=steric_stiffness,
+        steric_law=steric_law,
         closest_parameters=closest_parameters,
         vec2=vec2,
     )
