@@ -1,8 +1,7 @@
 """How the contacts of a step answer to forces: products with the compliance W, without the matrix.
 
 A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda. B puts it on
-the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off; in
-time proportional to nodes and contacts.
+the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off.
 
 One block of threads takes one cell: on CUDA its lanes share every loop and wait for each other between them, on a CPU
 a single lane does it all.
@@ -16,9 +15,10 @@ import warp as wp
 
 from warpflag_kernels import banded, chain, contacts
 from warpflag_kernels import flow as flow_stage
-from warpflag_kernels.types import Precision, structs
+from warpflag_kernels.types import DeviceModel, Precision, structs
 
 LANES = 128  # threads of a block on CUDA
+DIRECTIONS = 10  # that the solution in the space of contacts keeps at most
 
 
 @wp.func_native("WP_TILE_SYNC();")
@@ -61,6 +61,27 @@ def struct(p: Precision) -> Any:
         failed: wp.array(dtype=wp.int32)  # 1: not solved
 
     return Law
+
+
+def allocate(model: DeviceModel, contacts_in: Any) -> Any:
+    """Arrays of the struct `Law`, for as many contacts as there is room for."""
+    p, cells, elements, total = model.precision, model.cell_count, model.element_count, len(contacts_in.gap)
+    vec6 = chain.types(p).vec6
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=model.device)
+
+    law = struct(p)()
+    for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
+        setattr(law, name, zeros(total, p.real))
+    law.basis, law.moved = zeros((DIRECTIONS + 1) * total, p.real), zeros(DIRECTIONS * total, p.real)
+    law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
+    law.on_body = zeros(model.flagellum_count, vec6)
+    law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)
+    law.partial = zeros(cells * LANES, p.real)
+    law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
+    law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
+    return law
 
 
 @functools.cache

@@ -20,10 +20,9 @@ import warp as wp
 
 from warpflag_kernels import banded, chain, compliance, contacts, steric
 from warpflag_kernels import flow as flow_stage
-from warpflag_kernels.compliance import LANES, meet, struct
+from warpflag_kernels.compliance import DIRECTIONS, LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-DIRECTIONS = 10  # of GMRES at most
 LEAST_REDUCTION, MOST_REDUCTION = 0.1, 0.001  # of the linear residual, at which GMRES stops
 PATIENCE = 4  # iterations of Newton's method after which it does not stop early: contacts are very stiff
 ITERATIONS = 60  # of Newton's method

@@ -11,11 +11,13 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpflag_kernels import chain, neighbours, steric
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
+PER_NODE = 4  # contacts that a cell has room for (eight bundled flagella have three)
 MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
 
 
@@ -347,6 +349,28 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             state.body_contact[e] = reaction
 
     return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, act=act)
+
+
+def allocate(model: DeviceModel, touching: bool) -> Any:
+    """Arrays of the struct `Contacts`; next to none where nothing can touch."""
+    p, device = model.precision, model.device
+    nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+    first = np.concatenate([[0], np.cumsum(PER_NODE * nodes if touching else np.ones_like(nodes))])
+    total, cells, elements = int(first[-1]), model.cell_count, model.element_count
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    c = struct(p)()
+    c.first = wp.array(first, dtype=wp.int32, device=device)
+    c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
+    c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
+    c.found = zeros(elements, wp.uint64)
+    c.body_head = zeros(model.flagellum_count, wp.int32)
+    c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
+    c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
+    c.normal = zeros(total, p.vec3)
+    return c
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:

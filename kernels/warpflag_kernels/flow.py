@@ -13,6 +13,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpflag_kernels import contacts, mobility, pair_sum
@@ -311,6 +312,31 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
             i += 1
 
     return SimpleNamespace(count=count, arrange=arrange, keep=keep)
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Flow`; none where forces cause no flows."""
+    flow, device = struct(model.precision)(), model.device
+    if model.switches.pairs == "none":
+        return flow
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
+    flow.node, flow.place = (zeros(model.element_count, wp.int32) for _ in range(2))
+    form = form_of(model)
+    results = () if form == "gathered" else ("ux", "uy", "uz")
+    for name in ("x", "y", "z", "fx", "fy", "fz", *results):
+        setattr(flow.sum, name, zeros(model.element_count, wp.float32))
+    if form == "kept":
+        first_flagellum = model.data.first_flagellum.numpy()
+        moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
+        pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
+        flow.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=device)
+        for name in ("c", "qx", "qy", "qz"):
+            setattr(flow, name, zeros(int(pairs[-1]), wp.float32))
+    return flow
 
 
 def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:

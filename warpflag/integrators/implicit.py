@@ -115,8 +115,8 @@ class ImplicitStepper:
             b.factors = band_lanes.build(p, model.groups)
         self._band = b
 
-        self._contacts, self._law = self._contact_arrays()
-        self._flow = self._flow_arrays()
+        self._contacts = contacts.allocate(model, self._touches)
+        self._law, self._flow = compliance.allocate(model, self._contacts), flow.allocate(model)
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
         i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
@@ -256,62 +256,3 @@ class ImplicitStepper:
         )
         s.probe = probe
         return s
-
-    def _flow_arrays(self) -> Any:
-        """The pair sum of force changes; empty where forces cause no flows."""
-        model = self._system.model
-        device, elements = model.device, model.element_count
-        sums = flow.struct(model.precision)()
-        if model.switches.pairs == "none":
-            return sums
-        sums.loaded, sums.start, sums.rest = (
-            wp.zeros(model.flagellum_count, dtype=wp.int32, device=device) for _ in range(3)
-        )
-        sums.node, sums.place = (wp.zeros(elements, dtype=wp.int32, device=device) for _ in range(2))
-        form = flow.form_of(model)
-        results = () if form == "gathered" else ("ux", "uy", "uz")
-        for name in ("x", "y", "z", "fx", "fy", "fz", *results):
-            setattr(sums.sum, name, wp.zeros(elements, dtype=wp.float32, device=device))
-        if form == "kept":
-            first_flagellum = model.data.first_flagellum.numpy()
-            moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
-            pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
-            sums.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=device)
-            for name in ("c", "qx", "qy", "qz"):
-                setattr(sums, name, wp.zeros(int(pairs[-1]), dtype=wp.float32, device=device))
-        return sums
-
-    def _contact_arrays(self) -> tuple[Any, Any]:
-        """Contacts and their law: room for four per node of a cell (eight bundled flagella need three)."""
-        model = self._system.model
-        p, device, elements = model.precision, model.device, model.element_count
-        first_node = model.data.first_node.numpy()
-        nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
-        capacity = 4 * nodes if self._touches else np.ones(len(nodes), dtype=int)
-        total, cells = int(capacity.sum()), len(nodes)
-
-        def zeros(count: int, dtype: Any) -> wp.array:
-            return wp.zeros(count, dtype=dtype, device=device)
-
-        c = contacts.struct(p)()
-        c.first = wp.array(np.concatenate([[0], np.cumsum(capacity)]), dtype=wp.int32, device=device)
-        c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
-        c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
-        c.found = zeros(elements, wp.uint64)
-        c.body_head = zeros(model.flagellum_count, wp.int32)
-        c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
-        c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
-        c.normal = zeros(total, p.vec3)
-
-        law = compliance.struct(p)()
-        for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
-            setattr(law, name, zeros(total, p.real))
-        law.basis = zeros((contact_law.DIRECTIONS + 1) * total, p.real)
-        law.moved = zeros(contact_law.DIRECTIONS * total, p.real)
-        law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
-        law.on_body = zeros(model.flagellum_count, chain.types(p).vec6)
-        law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, chain.types(p).vec6)
-        law.partial = zeros(cells * compliance.LANES, p.real)
-        law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
-        law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
-        return c, law
