@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from warpflag_kernels import body, chain, contact_law, contacts, correction, flow, implicit
+from warpflag_kernels import body, chain, contact_law, contact_search, contacts, correction, flow, implicit
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, close, dense_solver, displacements, flat, spins
 from tests.helpers import shaken, touching_cell
@@ -19,7 +19,7 @@ from tests.oracles import CUTOFF, body_gaps, segment_distances
 from warpflag.integrators.stepper import DEFAULT_ACCURACY
 
 SIGMA = 0.04
-REACH = (CUTOFF + contacts.MARGIN) * SIGMA
+REACH = (CUTOFF + contact_search.MARGIN) * SIGMA
 STEP, GAIN = 1e-5, 2 / 3  # s, and g of BDF2 at a constant step
 FINE = contact_law.FINEST * SIGMA
 CONTROLLED = implicit.GAP_SHARE * DEFAULT_ACCURACY * 1e3  # tolerance of a gap per step, usual accuracy [um/s]
@@ -42,7 +42,7 @@ def touching(values: dict[str, Any], precision: str, device: str, seed: int = 1,
 
 
 def find(b: Bench) -> None:
-    contacts.find(b.model, b.state, b.stepper._now, b.stepper._contacts)
+    contact_search.find(b.model, b.state, b.stepper._now, b.stepper._contacts)
 
 
 # The list.
@@ -498,7 +498,7 @@ def test_contacts_are_those_of_the_pose_that_is_predicted(name, device, precisio
     predicted = l.solve(free)
     x = b.increment(predicted[:6], predicted[6:].reshape(-1, 4))
     chain.retract(b.model, b.state, s._now, s.data.one, x, s._trial)
-    contacts.find(b.model, s._trial_state, s._trial, s._contacts)
+    contact_search.find(b.model, s._trial_state, s._trial, s._contacts)
     contact_law.press(b.model, b.state, s.data.one, x, s._contacts, s._law)
     flow.build(b.model, b.state, s._flow, s._contacts)
     l.levers = dense_levers(b)

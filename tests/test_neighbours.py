@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from warpflag_kernels import contacts, neighbours, steric
+from warpflag_kernels import contact_search, neighbours, steric
 
 from tests.helpers import cell, touching_cell, unit
 from tests.oracles import CUTOFF, segment_distances
@@ -78,7 +78,7 @@ class Cells:
         for c in range(self.model.cell_count):
             own = self.segments[self.cell[self.segments] == c]
             p, d = x[own - 1], x[own] - x[own - 1]
-            near = segment_distances(p, d, p, d) < (CUTOFF + contacts.MARGIN) * SIGMA
+            near = segment_distances(p, d, p, d) < (CUTOFF + contact_search.MARGIN) * SIGMA
             near &= self.flagellum[own][:, None] != self.flagellum[own]
             for i, j in np.argwhere(near):
                 found[own[i]].add(int(own[j]))

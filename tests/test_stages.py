@@ -81,7 +81,7 @@ def test_on_a_cpu_the_right_hand_side_is_one_launch(monkeypatch):
 
 def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
     implicit = {"numerics.stepper": "implicit"}
-    solver = {"contacts", "contact_law"}
+    solver = {"contacts", "contact_search", "contact_law"}
     assert stages_of(launches(cell(implicit), monkeypatch)) & solver == solver
     off = {"steric.enabled": False, "body.contact": False, **implicit}
     assert not stages_of(launches(cell(off), monkeypatch)) & solver

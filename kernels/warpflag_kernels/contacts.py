@@ -1,10 +1,8 @@
-"""Contacts of an implicit step: which pairs may touch, where, and along which direction.
+"""Contacts of an implicit step: the list of pairs that may touch, and the levers through which their forces act.
 
 A contact that closes inside a step has no stiffness before it, so linearising its force across the step would let it
 pass. The step instead treats the gaps of all pairs that may close as unknowns and solves the force law exactly in
-their space. This stage finds the pairs within the cutoff plus a margin, flagellum against flagellum and node against
-body, and keeps them in one list per cell: counted per segment, summed, filled, and chained for the segments of the
-other side; no atomics, the same order every time.
+their space; `contact_search` finds them.
 """
 
 import functools
@@ -14,16 +12,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels import chain, neighbours, steric
+from warpflag_kernels import chain
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 PER_NODE = 4  # contacts that a cell has room for (eight bundled flagella have three)
-MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Contacts`. A cell's list lies in [first, first + count); `first` are multiples of the group size."""
+    """The struct `Contacts`. A cell's list lies in [first, first + count)."""
     real, vec3 = p.real, p.vec3
 
     @wp.struct
@@ -137,193 +134,12 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
+def _kernel(p: Precision, body: bool) -> Any:
     real, vec3 = p.real, p.vec3
-    Model, State, Contacts, Pose = structs(p).Model, structs(p).State, struct(p), chain.types(p).Pose
-    Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
-    near_by = neighbours.functions(p)
-    candidates, candidate, first_later, beside = (
-        near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
-    )  # fmt: skip
-    all_slots = wp.constant(neighbours.SLOTS)
-    reach_factor, segment_loads = real(steric.CUTOFF + MARGIN), functions(p).segment_loads
-    module = p.module("contacts", ("segments" if segments else "") + ("body" if body else ""))
+    Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
+    segment_loads = functions(p).segment_loads
 
-    @wp.func(module=module)
-    def direction(apart: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
-        """Normal of two segments along d1, d2 that are apart by a vector of length r."""
-        if r > real(1.0e-3) * diameter:
-            return apart / r
-        return wp.normalize(wp.cross(d1, d2))  # centre lines that touch: part them across both
-
-    @wp.func(module=module)
-    def visit(model: Model, pose: Pose, near: Neighbours, contacts: Contacts, e: wp.int32, write: wp.int32):
-        """Contacts that belong to element e: with segments of later flagella, and with the body."""
-        k = model.flagellum_of[e]
-        c = model.cell_of[e]
-        reach = reach_factor * model.steric_diameter[c]
-        found = int(0)
-        q1 = pose.position[e]
-        if wp.static(segments):
-            p1 = pose.position[e - 1]
-            middle = real(0.5) * (p1 + q1)
-            own_reach = real(0.5) * pose.length[e] + reach
-            n = candidates(model, near, e)
-            seen = wp.uint64(0)  # which candidates are contacts; those of a longer list are looked at twice
-            if write >= 0 and n <= all_slots:
-                seen = contacts.found[e]
-            entry = first_later(model, near, e)
-            bit = wp.uint64(1)
-            while entry < n:
-                j = candidate(model, near, e, entry)
-                skipped = write >= 0 and n <= all_slots and (seen & bit) == wp.uint64(0)
-                if j >= 0 and not skipped:
-                    p2 = pose.position[j - 1]
-                    q2 = pose.position[j]
-                    away = middle - real(0.5) * (p2 + q2)
-                    half = real(0.5) * pose.length[j]
-                    within = own_reach + half
-                    if wp.dot(away, away) < within * within and not beside(
-                        away, pose.tangent[e], pose.tangent[j], half, reach
-                    ):
-                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-                        apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
-                        r = wp.length(apart)
-                        if r < reach:
-                            if write >= 0:
-                                i = write + found
-                                contacts.segment[i] = e
-                                contacts.other[i] = j
-                                contacts.at[i] = st[0]
-                                contacts.at_other[i] = st[1]
-                                contacts.gap[i] = r
-                                anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
-                                first = model.first_node[model.flagellum_of[j]]
-                                contacts.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
-                                diameter = model.steric_diameter[c]
-                                contacts.normal[i] = direction(apart, r, q1 - p1, q2 - p2, diameter)
-                            found += 1
-                            seen = seen | bit
-                entry += 1
-                bit = bit << wp.uint64(1)
-            if write < 0:
-                contacts.found[e] = seen
-        if wp.static(body):
-            axis = pose.body_axis[c]
-            half = model.body_half_length[c]
-            away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
-            distance = wp.length(away_from_axis)
-            if distance - model.body_radius[c] < reach:
-                if write >= 0:
-                    i = write + found
-                    contacts.segment[i] = e
-                    contacts.other[i] = -1
-                    contacts.at[i] = real(1.0)
-                    contacts.at_other[i] = real(0.0)
-                    contacts.gap[i] = distance - model.body_radius[c]
-                    contacts.normal[i] = away_from_axis / distance
-                found += 1
-        return found
-
-    @wp.kernel(module=module)
-    def count(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        pose: Pose,
-        near: Neighbours,
-        # Out:
-        contacts: Contacts,
-    ):
-        e = wp.tid()
-        if state.active[model.cell_of[e]] == 0:
-            return
-        contacts.stop[e] = 0
-        if e > model.first_node[model.flagellum_of[e]]:
-            contacts.stop[e] = visit(model, pose, near, contacts, e, -1)
-
-    @wp.kernel(module=module)
-    def sum_up(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        contacts: Contacts,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
-        begin = contacts.first[c]
-        total = int(0)
-        e = model.first_node[model.first_flagellum[c]]
-        end = model.first_node[model.first_flagellum[c + 1]]
-        while e < end:
-            own = contacts.stop[e]
-            if begin + total + own > contacts.first[c + 1]:
-                contacts.overflow[c] = 1
-                own = 0
-            contacts.start[e] = begin + total
-            total += own
-            contacts.stop[e] = begin + total
-            e += 1
-        contacts.count[c] = total
-
-    @wp.kernel(module=module)
-    def fill(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        pose: Pose,
-        near: Neighbours,
-        # Out:
-        contacts: Contacts,
-    ):
-        e = wp.tid()
-        if state.active[model.cell_of[e]] != 0 and contacts.stop[e] > contacts.start[e]:
-            visit(model, pose, near, contacts, e, contacts.start[e])
-
-    @wp.kernel(module=module)
-    def link(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        contacts: Contacts,
-    ):
-        k = wp.tid()
-        begin = model.first_node[k]
-        end = model.first_node[k + 1]
-        c = model.cell_of[begin]
-        if state.active[c] == 0:
-            return
-        e = begin
-        while e < end:
-            contacts.head[e] = -1
-            e += 1
-        if wp.static(segments):
-            i = contacts.first[c] + contacts.count[c] - 1
-            while i >= contacts.first[c]:
-                j = contacts.other[i]
-                if j >= begin and j < end:
-                    contacts.next[i] = contacts.head[j]
-                    contacts.head[j] = i
-                i -= 1
-        head = int(-1)
-        if wp.static(body):
-            e = end - 1
-            while e > begin:
-                i = contacts.stop[e] - 1  # a node's contact with the body is the last it lists
-                if i >= contacts.start[e] and contacts.other[i] < 0:
-                    contacts.next[i] = head
-                    head = i
-                e -= 1
-        contacts.body_head[k] = head
-
-    @wp.kernel(module=module)
+    @wp.kernel(module=p.module("contacts", "body" if body else ""))
     def act(
         # Model:
         model: Model,
@@ -348,7 +164,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 reaction = magnitude[i] * contacts.normal[i]
             state.body_contact[e] = reaction
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, act=act)
+    return act
 
 
 def allocate(model: DeviceModel, touching: bool) -> Any:
@@ -373,24 +189,9 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
     return c
 
 
-def find(model: DeviceModel, state: DeviceState, pose: Any, contacts: Any) -> None:
-    """Lists every pair of a pose that is in contact or may come into contact within a step.
-
-    Args:
-        pose: the one that `state` holds.
-    """
-    if model.switches.steric:
-        neighbours.refresh(model, state)
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
-    inputs, device = [model.data, state.data, pose, state.neighbours, contacts], model.device
-    wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
-    wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts], device=device)
-    wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
-    wp.launch(kernels.link, model.flagellum_count, inputs=[model.data, state.data, contacts], device=device)
-
-
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
     """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
     inputs = [model.data, contacts, magnitude, state.data]
-    wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)
+    wp.launch(
+        _kernel(model.precision, model.switches.body_contact), model.element_count, inputs=inputs, device=model.device
+    )

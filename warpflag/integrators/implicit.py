@@ -16,6 +16,7 @@ from warpflag_kernels import (
     chart,
     compliance,
     contact_law,
+    contact_search,
     contacts,
     control,
     correction,
@@ -149,7 +150,7 @@ class ImplicitStepper:
         wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
         if self._touches:
             chain.retract(model, state, self._now, i.trust, self._predicted, self._trial)
-            contacts.find(model, self._trial_state, self._trial, self._contacts)
+            contact_search.find(model, self._trial_state, self._trial, self._contacts)
             contact_law.press(model, state, i.trust, self._predicted, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)

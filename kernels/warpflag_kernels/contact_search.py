@@ -1,0 +1,223 @@
+"""The search for contacts: which pairs may touch in a step, where, and along which direction.
+
+Pairs within the cutoff plus a margin, flagellum against flagellum and node against body, go into one list per cell:
+counted per segment, summed, filled, and chained for the segments of the other side; no atomics, the same order every
+time.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels import chain, contacts, neighbours, steric
+from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
+
+MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
+
+
+@functools.cache
+def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State, Contacts, Pose = structs(p).Model, structs(p).State, contacts.struct(p), chain.types(p).Pose
+    Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
+    near_by = neighbours.functions(p)
+    candidates, candidate, first_later, beside = (
+        near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
+    )  # fmt: skip
+    all_slots = wp.constant(neighbours.SLOTS)
+    reach_factor = real(steric.CUTOFF + MARGIN)
+    module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
+
+    @wp.func(module=module)
+    def direction(apart: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
+        """Normal of two segments along d1, d2 that are apart by a vector of length r."""
+        if r > real(1.0e-3) * diameter:
+            return apart / r
+        return wp.normalize(wp.cross(d1, d2))  # centre lines that touch: part them across both
+
+    @wp.func(module=module)
+    def visit(model: Model, pose: Pose, near: Neighbours, listed: Contacts, e: wp.int32, write: wp.int32):
+        """Contacts that belong to element e: with segments of later flagella, and with the body."""
+        k = model.flagellum_of[e]
+        c = model.cell_of[e]
+        reach = reach_factor * model.steric_diameter[c]
+        found = int(0)
+        q1 = pose.position[e]
+        if wp.static(segments):
+            p1 = pose.position[e - 1]
+            middle = real(0.5) * (p1 + q1)
+            own_reach = real(0.5) * pose.length[e] + reach
+            n = candidates(model, near, e)
+            seen = wp.uint64(0)  # which candidates are contacts; those of a longer list are looked at twice
+            if write >= 0 and n <= all_slots:
+                seen = listed.found[e]
+            entry = first_later(model, near, e)
+            bit = wp.uint64(1)
+            while entry < n:
+                j = candidate(model, near, e, entry)
+                skipped = write >= 0 and n <= all_slots and (seen & bit) == wp.uint64(0)
+                if j >= 0 and not skipped:
+                    p2 = pose.position[j - 1]
+                    q2 = pose.position[j]
+                    away = middle - real(0.5) * (p2 + q2)
+                    half = real(0.5) * pose.length[j]
+                    within = own_reach + half
+                    if wp.dot(away, away) < within * within and not beside(
+                        away, pose.tangent[e], pose.tangent[j], half, reach
+                    ):
+                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
+                        apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+                        r = wp.length(apart)
+                        if r < reach:
+                            if write >= 0:
+                                i = write + found
+                                listed.segment[i] = e
+                                listed.other[i] = j
+                                listed.at[i] = st[0]
+                                listed.at_other[i] = st[1]
+                                listed.gap[i] = r
+                                anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
+                                first = model.first_node[model.flagellum_of[j]]
+                                listed.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
+                                diameter = model.steric_diameter[c]
+                                listed.normal[i] = direction(apart, r, q1 - p1, q2 - p2, diameter)
+                            found += 1
+                            seen = seen | bit
+                entry += 1
+                bit = bit << wp.uint64(1)
+            if write < 0:
+                listed.found[e] = seen
+        if wp.static(body):
+            axis = pose.body_axis[c]
+            half = model.body_half_length[c]
+            away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
+            distance = wp.length(away_from_axis)
+            if distance - model.body_radius[c] < reach:
+                if write >= 0:
+                    i = write + found
+                    listed.segment[i] = e
+                    listed.other[i] = -1
+                    listed.at[i] = real(1.0)
+                    listed.at_other[i] = real(0.0)
+                    listed.gap[i] = distance - model.body_radius[c]
+                    listed.normal[i] = away_from_axis / distance
+                found += 1
+        return found
+
+    @wp.kernel(module=module)
+    def count(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        pose: Pose,
+        near: Neighbours,
+        # Out:
+        listed: Contacts,
+    ):
+        e = wp.tid()
+        if state.active[model.cell_of[e]] == 0:
+            return
+        listed.stop[e] = 0
+        if e > model.first_node[model.flagellum_of[e]]:
+            listed.stop[e] = visit(model, pose, near, listed, e, -1)
+
+    @wp.kernel(module=module)
+    def sum_up(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        listed: Contacts,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        begin = listed.first[c]
+        total = int(0)
+        e = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        while e < end:
+            own = listed.stop[e]
+            if begin + total + own > listed.first[c + 1]:
+                listed.overflow[c] = 1
+                own = 0
+            listed.start[e] = begin + total
+            total += own
+            listed.stop[e] = begin + total
+            e += 1
+        listed.count[c] = total
+
+    @wp.kernel(module=module)
+    def fill(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        pose: Pose,
+        near: Neighbours,
+        # Out:
+        listed: Contacts,
+    ):
+        e = wp.tid()
+        if state.active[model.cell_of[e]] != 0 and listed.stop[e] > listed.start[e]:
+            visit(model, pose, near, listed, e, listed.start[e])
+
+    @wp.kernel(module=module)
+    def link(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        listed: Contacts,
+    ):
+        k = wp.tid()
+        begin = model.first_node[k]
+        end = model.first_node[k + 1]
+        c = model.cell_of[begin]
+        if state.active[c] == 0:
+            return
+        e = begin
+        while e < end:
+            listed.head[e] = -1
+            e += 1
+        if wp.static(segments):
+            i = listed.first[c] + listed.count[c] - 1
+            while i >= listed.first[c]:
+                j = listed.other[i]
+                if j >= begin and j < end:
+                    listed.next[i] = listed.head[j]
+                    listed.head[j] = i
+                i -= 1
+        head = int(-1)
+        if wp.static(body):
+            e = end - 1
+            while e > begin:
+                i = listed.stop[e] - 1  # a node's contact with the body is the last it lists
+                if i >= listed.start[e] and listed.other[i] < 0:
+                    listed.next[i] = head
+                    head = i
+                e -= 1
+        listed.body_head[k] = head
+
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link)
+
+
+def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
+    """Lists every pair of a pose that is in contact or may come into contact within a step.
+
+    Args:
+        pose: the one that `state` holds.
+    """
+    if model.switches.steric:
+        neighbours.refresh(model, state)
+    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    inputs, device = [model.data, state.data, pose, state.neighbours, contacts_out], model.device
+    wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts_out], device=device)
+    wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
+    wp.launch(kernels.link, model.flagellum_count, inputs=[model.data, state.data, contacts_out], device=device)
