@@ -145,7 +145,9 @@ class Simulation:
             yield frame_of(self._framed, before, first_node, length)
 
     def prepare(self) -> None:
-        """Compiles and loads every kernel and captures the pass; otherwise the first `advance` does."""
+        """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
+        if not self._checked:
+            self._check_start()
         if not self._capture or self._graph is not None:
             return
         # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
@@ -168,8 +170,6 @@ class Simulation:
         """
         control, state = self.system.control, self.system.state.data
         self.prepare()
-        if not self._checked:
-            self._check_start()
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
         if not waiting.any():
             self._raise_fault()

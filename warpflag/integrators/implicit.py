@@ -250,7 +250,7 @@ class ImplicitStepper:
         s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
         s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
         s.look, s.active = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
-        s.due = wp.zeros(1, dtype=wp.int32, device=device)
+        s.due = wp.ones(1, dtype=wp.int32, device=device)  # its kernels load in the first pass, which takes no step
         nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
         probe.node.assign(
             np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes])
