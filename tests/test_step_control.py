@@ -56,7 +56,7 @@ def test_steps_are_small_at_switch_on_and_grow(stepper, device, precision):
         sim.advance(until)
         steps.append((until - time) / (sim.steps[0] - before))  # their mean
     assert steps[0] < 5e-8 and steps[-1] > 5e-6
-    assert (np.diff(steps) > 0).all(), steps
+    assert (np.diff(steps[:4]) > 0).all(), steps  # then they are what the accuracy asks for
 
 
 @pytest.mark.parametrize("stepper", ["implicit", "rkc"])

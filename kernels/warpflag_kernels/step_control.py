@@ -13,7 +13,7 @@ import warp as wp
 
 from warpflag_kernels.types import Precision
 
-LARGEST_GROWTH = 1.9  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
+LARGEST_GROWTH = 2.0  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
 REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]
