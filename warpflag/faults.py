@@ -18,7 +18,7 @@ _ADVICE = {
     ),
     Fault.TWIST: (
         "a joint is twisted by more than 90 degrees",
-        "take a shorter numerics.time_step or flagella.segment_length, or a lower motor.torque",
+        "take a lower motor.torque, or a shorter flagella.segment_length or numerics.time_step",
     ),
     Fault.FOLD: (
         "a joint is folded back on itself",
@@ -30,7 +30,7 @@ _ADVICE = {
     ),
     Fault.UNSOLVED: (
         "no step, however short, could be solved",
-        "take numerics.stepper = rkc, a lower steric.strength or a lower motor.torque",
+        "take a lower steric.strength or motor.torque, or numerics.stepper = rkc",
     ),
 }
 

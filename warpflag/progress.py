@@ -12,6 +12,8 @@ __all__ = ["Progress"]
 _BAR_CELLS = 16
 _TERMINAL_INTERVAL = 0.1
 _LOG_INTERVAL = 1.0
+_TELLING_SECONDS = 2.0
+_TELLING_SHARE = 0.01
 
 
 class Progress:
@@ -84,7 +86,9 @@ class Progress:
             filled = int(_BAR_CELLS * fraction)
             line = f"[{'#' * filled}{'.' * (_BAR_CELLS - filled)}] {line}"
         simulated = self._time - self._start[1]
-        if simulated > 0.0:
+        # What the first moments cost says nothing of the run.
+        telling = now - self._start[0] > _TELLING_SECONDS or simulated >= _TELLING_SHARE * self._total
+        if simulated > 0.0 and telling:
             cost = (now - self._start[0]) / simulated
             line += f"  {cost:.{0 if cost >= 100.0 else 1}f} ms per ms"
             if self._time < self._total:

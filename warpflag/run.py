@@ -120,7 +120,8 @@ class Run:
             summary = {**ending, **self._facts(fault), **found}
             write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
             write_movie(record, self.directory / MOVIE_NAME)
-        reached = f"{found['frames']} frames to {found['time'] * 1e3:.6g} ms"
+        count = found["frames"]
+        reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
         return {
             "done": f"{reached} in {wall_time:.1f} s: {self.directory}",
             "interrupted": f"interrupted, {reached} kept; resumable with --resume {self.directory}",

@@ -1,6 +1,6 @@
 """Many flagella with the implicit stepper: what one of them costs in a crowd, and how far the accuracy holds.
 
-    uv run examples/benchmarks/crowds.py                     two, three, four and eight flagella, a minute
+    uv run examples/benchmarks/crowds.py                     two, three, four and eight flagella
     uv run examples/benchmarks/crowds.py --counts 2 4 --finer 2e-3
 
 10 ms from the start at one accuracy, 1e-2 um per ms; eight are examples/eight_flagella.toml. Cost: CPU time per
