@@ -148,6 +148,7 @@ def build_state(model: DeviceModel) -> DeviceState:
     if model.switches.steric:
         near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
         near.left, near.stale = zeros(flagella, wp.int32), zeros(cells, wp.int32)
+        near.longest = zeros(flagella, p.real)
         near.count, near.earlier = zeros(elements, wp.int32), zeros(elements, wp.int32)
         near.segment = zeros(elements * neighbours.SLOTS, wp.int32)
     return DeviceState(s, pairs, near)
@@ -215,8 +216,8 @@ def build_guard(model: DeviceModel, chart: Any) -> Any:
     g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
     if model.switches.steric:
         g.position = wp.clone(chart.base_position)
-        g.moved, g.shifted = (
-            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(2)
+        g.longest, g.moved, g.shifted = (
+            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(3)
         )
     return g
 

@@ -58,6 +58,7 @@ def struct(p: Precision) -> Any:
         interval: wp.array(dtype=wp.int32)  # [C], steps between two checks
         # Empty where nothing can cross.
         position: wp.array(dtype=vec3)  # [E], at the last check [um]
+        longest: wp.array(dtype=real)  # [K], its longest segment [um]
         moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
         shifted: wp.array(dtype=real)  # [K], the same since the lists of neighbours were built [um]
 
@@ -241,7 +242,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 if met(state, guard, e, j, moved, touch):
                     wp.atomic_min(control.fault, c, crossing + e)
                 distance = wp.length(middle(state, e) - middle(state, j))
-                j = next_near(state.length, j, end, distance, reach)
+                j = next_near(guard.longest[other], j, distance, reach)
             other += 1
 
     @wp.kernel(module=module)
@@ -260,10 +261,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         moved = real(0.0)
         shifted = real(0.0)
+        longest = real(0.0)
         while e < model.first_node[k + 1]:
+            if e > model.first_node[k]:
+                longest = wp.max(longest, state.length[e])
             moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
             shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
             e += 1
+        guard.longest[k] = longest
         guard.moved[k] = moved
         guard.shifted[k] = shifted
 

@@ -16,6 +16,7 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
 SKIN = 0.1  # [um]
 SLOTS = 64  # segments that a list holds
+SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
 
 
 @functools.cache
@@ -23,7 +24,7 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
     real, vec3 = p.real, p.vec3
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
-    slots = wp.constant(SLOTS)
+    slots, slack = wp.constant(SLOTS), wp.constant(real(SLACK))
     module = p.module("neighbours_functions")
 
     @wp.func(module=module)
@@ -58,19 +59,16 @@ def functions(p: Precision) -> SimpleNamespace:
         return real(0.5) * (state.position[e - 1] + state.position[e])
 
     @wp.func(module=module)
-    def next_near(length: wp.array(dtype=real), j: wp.int32, end: wp.int32, distance: real, reach: real):
-        """The next segment of a chain that can be near: along it, midpoints move on by no more than the lengths.
+    def next_near(longest: real, j: wp.int32, distance: real, reach: real):
+        """The next segment of a flagellum that can be near: along it, midpoints move on by no more than the lengths.
 
         Args:
+            longest: length of its longest segment [um].
             distance: of the midpoint of segment j [um].
             reach: how near a segment must come, its own half length not counted [um].
         """
-        bound = distance - real(0.5) * length[j]
-        i = j + 1
-        while i < end and bound - length[i] > reach:  # false for NaN
-            bound -= length[i]
-            i += 1
-        return i
+        skipped = (distance - reach) / (slack * longest) - real(0.5)
+        return j + 1 + int(wp.where(skipped > real(0.0), wp.min(skipped, real(1.0e6)), real(0.0)))  # none for NaN
 
     @wp.func(module=module)
     def beside(away: vec3, t: vec3, u: vec3, half_length: real, distance: real):
@@ -108,14 +106,18 @@ def lists(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
-        """1: a node of flagellum k has moved by more than half the skin; else 0."""
+        """1: a node of flagellum k has moved by more than half the skin; else 0. Also finds its longest segment."""
         left = int(0)
+        longest = real(0.0)
         e = model.first_node[k]
         while e < model.first_node[k + 1]:
             d = state.position[e] - near.position[e]
             if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
                 left = 1
+            if e > model.first_node[k]:
+                longest = wp.max(longest, state.length[e])
             e += 1
+        near.longest[k] = longest
         return left
 
     @wp.func(module=module)
@@ -140,7 +142,7 @@ def lists(p: Precision) -> SimpleNamespace:
                         if found < slots:
                             near.segment[e * slots + found] = j
                         found += 1
-                    j = next_near(state.length, j, end, distance, beyond + skin + real(0.1) * state.length[j])
+                    j = next_near(near.longest[k], j, distance, beyond + skin)
                 k += 1
         near.count[e] = wp.where(found <= slots, found, -1)
 

@@ -164,6 +164,7 @@ def structs(p: Precision) -> SimpleNamespace:
     class Neighbours:
         position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
         left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
+        longest: wp.array(dtype=real)  # [K], segment when that was last asked [um]
         stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
         earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
