@@ -48,6 +48,19 @@ def test_speed_and_time_left():
     assert "34 %" in line and "5.10 / 15.00 ms" in line and "600 ms per ms" in line and "6 s left" in line
 
 
+def test_first_moments_tell_nothing_of_the_rate():
+    stream, clock = Screen(), Clock()
+    progress = Progress(0.015, stream, clock=clock)
+    progress.update(0.0)
+    for seconds, time in ((1.0, 1e-5), (1.5, 1e-4)):  # under two seconds and one per cent: no word yet
+        clock.now = Clock.now + seconds
+        progress.update(time)
+        assert "per ms" not in stream.getvalue() and "left" not in stream.getvalue()
+    clock.now = Clock.now + 2.5
+    progress.update(1.2e-4)
+    assert "per ms" in stream.getvalue() and "left" in stream.getvalue()
+
+
 @pytest.mark.parametrize(
     ("seconds_per_update", "expected"), [(2.0, "3:20 min left"), (60.0, "1:40 h left"), (0.001, "10.0 ms per ms")]
 )

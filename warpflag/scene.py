@@ -180,7 +180,7 @@ class Scene(Section, key=""):
         if wanted is None:
             return
         if self.flagella.count < 2:
-            raise SceneError(key, wanted, "needs two flagella, of one leave it out", ["flagella.count"])
+            raise SceneError(key, wanted, "needs two flagella; leave it out for one", ["flagella.count"])
         for k, own in enumerate(self.flagellum[:2]):
             if own.phase is not None:
                 given = f"flagellum.{k}.phase"

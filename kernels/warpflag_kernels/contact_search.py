@@ -19,9 +19,10 @@ MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigm
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+    real = p.real
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, contacts.struct(p), chain.types(p).Pose
-    Neighbours, closest_parameters = structs(p).Neighbours, steric.functions(p).closest_parameters
+    Neighbours = structs(p).Neighbours
+    nearest, direction = steric.functions(p).nearest, steric.functions(p).direction
     near_by = neighbours.functions(p)
     candidates, candidate, first_later, beside = (
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
@@ -29,13 +30,6 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     all_slots = wp.constant(neighbours.SLOTS)
     reach_factor = real(steric.CUTOFF + MARGIN)
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
-
-    @wp.func(module=module)
-    def direction(apart: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
-        """Normal of two segments along d1, d2 that are apart by a vector of length r."""
-        if r > real(1.0e-3) * diameter:
-            return apart / r
-        return wp.normalize(wp.cross(d1, d2))  # centre lines that touch: part them across both
 
     @wp.func(module=module)
     def visit(model: Model, pose: Pose, near: Neighbours, listed: Contacts, e: wp.int32, write: wp.int32):
@@ -67,16 +61,15 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     if wp.dot(away, away) < within * within and not beside(
                         away, pose.tangent[e], pose.tangent[j], half, reach
                     ):
-                        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-                        apart = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+                        at, at_other, apart = nearest(p1, q1, p2, q2)
                         r = wp.length(apart)
                         if r < reach:
                             if write >= 0:
                                 i = write + found
                                 listed.segment[i] = e
                                 listed.other[i] = j
-                                listed.at[i] = st[0]
-                                listed.at_other[i] = st[1]
+                                listed.at[i] = at
+                                listed.at_other[i] = at_other
                                 listed.gap[i] = r
                                 anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
                                 first = model.first_node[model.flagellum_of[j]]

@@ -129,6 +129,7 @@ def form_of(model: DeviceModel) -> str:
 
 
 def sums_by_halves(model: DeviceModel) -> bool:
+    """Whether a thread sums a whole cell and takes every pair once for both of its nodes."""
     return form_of(model) == "halves"
 
 

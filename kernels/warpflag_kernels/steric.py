@@ -35,21 +35,8 @@ def functions(p: Precision) -> SimpleNamespace:
     linear_below, force_there, slope_there = real(LINEAR_BELOW), real(_FORCE_THERE), real(_SLOPE_THERE)
 
     @wp.func(module=p.module("steric_functions"))
-    def steric_force(r: real, strength: real, diameter: real):
-        """Repulsion at distance r [pN]; r may be negative (a node below the body surface)."""
-        x = r / diameter
-        if x >= cutoff:
-            return real(0.0)
-        if x < linear_below:
-            return strength * (force_there + slope_there * (linear_below - x))
-        y = real(1.0) / x
-        y3 = y * y * y
-        y6 = y3 * y3
-        return strength * y6 * y * (real(2.0) * y6 - real(1.0))
-
-    @wp.func(module=p.module("steric_functions"))
     def steric_law(r: real, strength: real, diameter: real):
-        """Repulsion F [pN] and stiffness -dF/dr [pN/um] at distance r."""
+        """Repulsion F [pN] and stiffness -dF/dr [pN/um] at distance r; r may be negative (a node below the surface)."""
         x = r / diameter
         if x >= cutoff:
             return real(0.0), real(0.0)
@@ -57,10 +44,16 @@ def functions(p: Precision) -> SimpleNamespace:
         if x < linear_below:
             return strength * (force_there + slope_there * (linear_below - x)), stiffness * slope_there
         y = real(1.0) / x
-        y2 = y * y
-        y6 = y2 * y2 * y2
+        y3 = y * y * y
+        y6 = y3 * y3
         force = strength * y6 * y * (real(2.0) * y6 - real(1.0))
-        return force, stiffness * y6 * y2 * (real(26.0) * y6 - real(7.0))
+        return force, stiffness * y6 * (y * y) * (real(26.0) * y6 - real(7.0))
+
+    @wp.func(module=p.module("steric_functions"))
+    def steric_force(r: real, strength: real, diameter: real):
+        """Repulsion at distance r [pN]."""
+        force, _stiffness = steric_law(r, strength, diameter)
+        return force
 
     @wp.func(module=p.module("steric_functions"))
     def closest_parameters(p1: vec3, d1: vec3, p2: vec3, d2: vec3):
@@ -87,10 +80,28 @@ def functions(p: Precision) -> SimpleNamespace:
             s = wp.clamp((b - c) / a, zero, one)
         return vec2(s, t)
 
+    @wp.func(module=p.module("steric_functions"))
+    def nearest(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
+        """Of segments p1 q1 and p2 q2: parameters of their closest points, and the way to the first from the second."""
+        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
+        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
+        return st[0], st[1], gap
+
+    @wp.func(module=p.module("steric_functions"))
+    def direction(gap: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
+        """Of the force on the first of two segments along d1 and d2, across a gap of length r."""
+        # Centre lines that touch exactly have no direction of their own: part them across both.
+        normal = gap / r
+        if r <= real(1.0e-3) * diameter:
+            normal = wp.normalize(wp.cross(d1, d2))  # changes sign with the side
+        return normal
+
     return SimpleNamespace(
         steric_force=steric_force,
         steric_law=steric_law,
         closest_parameters=closest_parameters,
+        nearest=nearest,
+        direction=direction,
         vec2=vec2,
     )
 
@@ -101,26 +112,11 @@ def gathers(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Neighbours = structs(p).Neighbours
-    steric_force, closest_parameters = functions(p).steric_force, functions(p).closest_parameters
-    candidates, candidate = neighbours.functions(p).candidates, neighbours.functions(p).candidate
+    law, near_by = functions(p), neighbours.functions(p)
+    steric_force, nearest, direction = law.steric_force, law.nearest, law.direction
+    candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
     cutoff = real(CUTOFF)
     module = p.module("steric_functions")
-
-    @wp.func(module=module)
-    def nearest(p1: vec3, q1: vec3, p2: vec3, q2: vec3):
-        """Of segments p1 q1 and p2 q2: parameters of their closest points, and the way to the first from the second."""
-        st = closest_parameters(p1, q1 - p1, p2, q2 - p2)
-        gap = p1 + st[0] * (q1 - p1) - (p2 + st[1] * (q2 - p2))
-        return st[0], st[1], gap
-
-    @wp.func(module=module)
-    def direction(gap: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
-        """Of the force on the first of two segments along d1 and d2, across a gap of length r."""
-        # Centre lines that touch exactly have no direction of their own: part them across both.
-        normal = gap / r
-        if r <= real(1.0e-3) * diameter:
-            normal = wp.normalize(wp.cross(d1, d2))  # changes sign with the side
-        return normal
 
     @wp.func(module=module)
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
@@ -180,11 +176,11 @@ def gathers(p: Precision) -> SimpleNamespace:
             middle = real(0.5) * (p1 + q1)
             reach = real(0.5) * state.length[e] + cutoff * diameter
             n = candidates(model, near, e)
-            i = int(0)
+            i = first_later(model, near, e)
             while i < n:
                 j = candidate(model, near, e, i)
                 i += 1
-                if j > e:
+                if j >= 0:
                     p2 = state.position[j - 1]
                     q2 = state.position[j]
                     away = middle - real(0.5) * (p2 + q2)
