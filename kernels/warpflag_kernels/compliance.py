@@ -39,9 +39,8 @@ def struct(p: Precision) -> Any:
         free_gap: wp.array(dtype=real)
         solved_gap: wp.array(dtype=real)
         residual: wp.array(dtype=real)
-        pressed: wp.array(dtype=real)  # force in the predicted pose [pN]
         force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to; between solutions: force - pressed [pN]
+        load: wp.array(dtype=real)  # what W is applied to [pN]
         change: wp.array(dtype=real)  # W load [um]
         yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
         root: wp.array(dtype=real)  # square root of the stiffness that a contact shows against it
@@ -72,7 +71,7 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
         return wp.zeros(count, dtype=dtype, device=model.device)
 
     law = struct(p)()
-    for name in ("free_gap", "solved_gap", "residual", "pressed", "force", "load", "change", "yielding", "root"):
+    for name in ("free_gap", "solved_gap", "residual", "force", "load", "change", "yielding", "root"):
         setattr(law, name, zeros(total, p.real))
     law.basis, law.moved = zeros((DIRECTIONS + 1) * total, p.real), zeros(DIRECTIONS * total, p.real)
     law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))

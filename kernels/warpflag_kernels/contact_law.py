@@ -101,12 +101,10 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             return
         i = contacts_out.first[c] + lane
         while i < contacts_out.first[c] + contacts_out.count[c]:
-            gap = contacts_out.gap[i]
+            gap = contacts_out.gap[i] + real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
             counted = wp.max(gap, deepest * model.steric_diameter[c])
-            law.pressed[i] = steric_force(counted, model.steric_strength[c], model.steric_diameter[c])
-            law.force[i] = law.pressed[i]
+            law.force[i] = steric_force(counted, model.steric_strength[c], model.steric_diameter[c])
             law.solved_gap[i] = gap
-            contacts_out.gap[i] = gap - real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
             i += lanes
 
     @wp.func(module=module)
@@ -338,7 +336,6 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         i = begin + lane
         while i < stop:
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
-            law.load[i] = law.force[i] - law.pressed[i]
             contacts_in.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
             i += lanes
         e = model.first_node[model.first_flagellum[c]] + lane

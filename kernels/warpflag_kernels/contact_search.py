@@ -197,7 +197,44 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 e -= 1
         listed.body_head[k] = head
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link)
+    @wp.kernel(module=module)
+    def renew(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        pose: Pose,
+        # Out:
+        listed: Contacts,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        q1 = pose.position[e]
+        i = listed.start[e]
+        while i < listed.stop[e]:
+            j = listed.other[i]
+            if j < 0:
+                axis = pose.body_axis[c]
+                half = model.body_half_length[c]
+                away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
+                distance = wp.length(away_from_axis)
+                listed.gap[i] = distance - model.body_radius[c]
+                listed.normal[i] = away_from_axis / distance
+            else:
+                p1 = pose.position[e - 1]
+                p2 = pose.position[j - 1]
+                q2 = pose.position[j]
+                at, at_other, apart = nearest(p1, q1, p2, q2)
+                r = wp.length(apart)
+                listed.at[i] = at
+                listed.at_other[i] = at_other
+                listed.gap[i] = r
+                listed.normal[i] = direction(apart, r, q1 - p1, q2 - p2, model.steric_diameter[c])
+            i += 1
+
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, renew=renew)
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
@@ -214,3 +251,10 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
     wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts_out], device=device)
     wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.link, model.flagellum_count, inputs=[model.data, state.data, contacts_out], device=device)
+
+
+def renew(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
+    """Gaps, directions and levers of the listed contacts in a pose."""
+    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    inputs = [model.data, state.data, pose, contacts_out]
+    wp.launch(kernels.renew, model.element_count, inputs=inputs, device=model.device)

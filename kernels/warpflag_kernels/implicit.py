@@ -1,15 +1,20 @@
-"""Linearly implicit stepping of second order: variable-step BDF2 around an extrapolated state.
+"""Linearly implicit stepping of second order: collocation of a quadratic path, solved in two iterations.
 
-With delta the last increment, w = dt/dt_last, A = (1 + 2w)/(1 + w) and g = 1/A, a step extrapolates by x = w delta,
-evaluates the velocities V there once, and solves for the correction e:
+The path leads through the last two states and the next one, and obeys the equations of motion at the time theta dt of
+the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it passes there at theta w delta + e, so
 
-    (1/dt + g M H) e = g [V - w delta/dt] + g M B (F - F_x)
+    e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
+
+and the whole step is w delta + e/rho. theta = 1 is BDF2; its error goes as 3 theta^2 - 1, and stiff modes are damped
+for any theta above 2^-1/2. Both iterations evaluate V once, at the pose known so far, and solve for what is missing:
+
+    (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
 in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
-the explicit flows of the pair sum stable. Contacts are those of a pose nearer to the end of the step, where a path
-that is quadratic in time leads: V holds their forces F_x at its gaps, and those that count, F, obey the exact law at
-the end of the step. Every step is checked before it is taken: solves, guards and the error estimate. A step that
-fails is taken again, shorter.
+the explicit flows of the pair sum stable; the second iteration squares what that leaves, and finds V, contacts and
+levers where the first one led. V holds the forces F_x that the contacts are thought to have, and those that count, F,
+obey the exact law. Every step is checked before it is taken: solves, guards and the error estimate. A step that fails
+is taken again, shorter.
 """
 
 import functools
@@ -28,7 +33,10 @@ from warpflag_kernels.types import Precision, structs
 
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
-PEAK = 4.2
+import os
+PEAK = float(os.environ.get('PEAK', '4.2')) / 12
+THETA = float(os.environ.get("THETA", "0.75"))  # where in a step the equations hold; 1 is BDF2
+LEAD = float(os.environ.get("LEAD", "0.5"))  # share of a prediction that a pose takes at most: with more, weak stiff modes grow
 GAP_SHARE = 0.5  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
@@ -45,8 +53,11 @@ def struct(p: Precision) -> Any:
         step_before: wp.array(dtype=wp.float64)  # [s]
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
+        reach: wp.array(dtype=wp.float64)  # rho
+        lead: wp.array(dtype=wp.float64)  # share of a prediction that the first pose takes
+        beyond: wp.array(dtype=wp.float64)  # trust beyond that
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
-        error: wp.array(dtype=real)  # [K], estimated node errors of a flagellum, their sum [um]
+        missed: wp.array(dtype=real)  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
         predicted: wp.array(dtype=real)  # [K], lengths of the displacements predicted for it, their sum [um]
         trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
         accepted: wp.array(dtype=wp.int32)
@@ -66,6 +77,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     f = step_control.functions(p)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("implicit")
+    theta, most_lead = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(LEAD))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     peak = wp.constant(wp.float64(PEAK))
@@ -94,9 +106,14 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = wp.float64(0.0)
         if imp.history[c] > 0:
             w = dt / imp.last_step[c]
-        g = (one + w) / (one + wp.float64(2.0) * w)
+        mu = w / (one + w)
+        rho = theta * (one - (one - theta) * mu)
+        g = rho / (one + (wp.float64(2.0) * theta - one) * mu)
         control.step[c] = dt
         imp.ratio[c] = w
+        imp.reach[c] = rho
+        imp.lead[c] = wp.min(imp.trust[c], most_lead)
+        imp.beyond[c] = imp.trust[c] - imp.lead[c]
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
@@ -109,48 +126,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.evaluations[c] += 1
 
     @wp.kernel(module=module)
-    def right_hand_side(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        imp: Implicit,
-        band: Band,
-        law: Law,
-        last: Increment,
-        # Out:
-        x: Increment,
-        drive: Increment,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
-        gain = real(law.gain[c])
-        slope = real(imp.ratio[c] / band.step[c])
-        carried = last.node[e]
-        spin = gain * (model.spin_mobility[k] * state.spin_torque[e] - slope * carried[3])
-        v = vec3(real(0.0))
-        if e > model.first_node[k]:
-            v = gain * (state.velocity[e] - slope * vec3(carried[0], carried[1], carried[2]))
-            drive.node[e] = vec4(v[0], v[1], v[2], spin)
-            t = state.tangent[e]
-            if e + 1 < model.first_node[k + 1]:
-                t = wp.normalize(t + state.tangent[e + 1])
-            along = wp.dot(t, v) * t
-            v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
-        else:
-            drive.node[e] = vec4(v[0], v[1], v[2], spin)
-        if e == model.first_node[model.first_flagellum[c]]:
-            u = state.body_velocity[c]
-            w = state.body_spin[c]
-            rate = gain * (vec6(u[0], u[1], u[2], w[0], w[1], w[2]) - slope * last.body[c])
-            x.body[c] = rate
-            drive.body[c] = rate
-        x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
-
-    @wp.kernel(module=module)
     def predict(
         # Model:
         model: Model,
@@ -160,66 +135,141 @@ def kernels(p: Precision) -> SimpleNamespace:
         last: Increment,
         before: Increment,
         # Out:
-        x: Increment,
+        predicted: Increment,
+        found: Increment,
+        way: Increment,
     ):
+        """What e is on a path that is quadratic in time, as the last two increments say; how much of it is taken for
+        found, and the way to the first pose."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
-        # On a path that is quadratic in time, as the last two increments say.
         scale = real(0.0)
         ratio = real(0.0)
         if imp.history[c] == 2:
             w = imp.ratio[c]
             ratio = real(imp.last_step[c] / imp.step_before[c])
-            scale = real(w * (w + wp.float64(1.0)) / (wp.float64(1.0) + imp.step_before[c] / imp.last_step[c]))
-        x.node[e] = scale * (last.node[e] - ratio * before.node[e])
+            curved = w * (w + wp.float64(1.0)) / (wp.float64(1.0) + imp.step_before[c] / imp.last_step[c])
+            scale = real(imp.reach[c] * curved)
+        lead = real(imp.lead[c])
+        ahead = real(theta * imp.ratio[c])
+        x = scale * (last.node[e] - ratio * before.node[e])
+        predicted.node[e] = x
+        found.node[e] = lead * x
+        way.node[e] = ahead * last.node[e] + lead * x
         if e == model.first_node[model.first_flagellum[c]]:
-            x.body[c] = scale * (last.body[c] - ratio * before.body[c])
+            b = scale * (last.body[c] - ratio * before.body[c])
+            predicted.body[c] = b
+            found.body[c] = lead * b
+            way.body[c] = ahead * last.body[c] + lead * b
 
     @wp.kernel(module=module)
-    def add_increments(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        imp: Implicit,
-        last: Increment,
-        x: Increment,
-        # Out:
-        total: Increment,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        w = real(imp.ratio[c])
-        total.node[e] = w * last.node[e] + x.node[e]
-        if e == model.first_node[model.first_flagellum[c]]:
-            total.body[c] = w * last.body[c] + x.body[c]
-
-    @wp.kernel(module=module)
-    def estimate_error(
+    def right_hand_side(
         # Model:
         model: Model,
         # State:
         state: State,
         imp: Implicit,
         band: Band,
+        law: Law,
         last: Increment,
+        found: Increment,
+        # Out:
+        x: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        gain = real(law.gain[c])
+        inv_dt = real(wp.float64(1.0) / band.step[c])
+        slope = gain * real(imp.ratio[c] / band.step[c])
+        gone = slope * last.node[e] + inv_dt * found.node[e]
+        spin = gain * model.spin_mobility[k] * state.spin_torque[e] - gone[3]
+        v = vec3(real(0.0))
+        if e > model.first_node[k]:
+            v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
+            t = state.tangent[e]
+            if e + 1 < model.first_node[k + 1]:
+                t = wp.normalize(t + state.tangent[e + 1])
+            along = wp.dot(t, v) * t
+            v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+        elif k == model.first_flagellum[c]:
+            u = state.body_velocity[c]
+            w = state.body_spin[c]
+            rate = gain * vec6(u[0], u[1], u[2], w[0], w[1], w[2])
+            x.body[c] = rate - slope * last.body[c] - inv_dt * found.body[c]
+        x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+
+    @wp.kernel(module=module)
+    def take(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        x: Increment,
+        # Out:
+        found: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        found.node[e] = found.node[e] + x.node[e]
+        if e == model.first_node[model.first_flagellum[c]]:
+            found.body[c] = found.body[c] + x.body[c]
+
+    @wp.kernel(module=module)
+    def complete(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        imp: Implicit,
+        last: Increment,
+        found: Increment,
         predicted: Increment,
         x: Increment,
         # Out:
+        total: Increment,
+        rest: Increment,
         chart: Chart,
     ):
+        """The whole step, what of it is left to go, and the error estimates of a flagellum."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
         if state.active[c] == 0:
             return
+        w = real(imp.ratio[c])
+        ahead = real(theta * imp.ratio[c])
+        whole = real(wp.float64(1.0) / imp.reach[c])
+        missed = real(0.0)
+        foreseen = real(0.0)
+        e = first
+        while e < model.first_node[k + 1]:
+            f = found.node[e] + x.node[e]
+            p = predicted.node[e]
+            d = f - p  # third divided difference of the path
+            t = w * last.node[e] + whole * f
+            total.node[e] = t
+            rest.node[e] = t - ahead * last.node[e] - found.node[e]
+            if e > first:
+                missed += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+                foreseen += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+            e += 1
+        if imp.history[c] != 2:
+            missed = real(0.0)
+        imp.missed[k] = whole * missed
+        imp.predicted[k] = whole * foreseen
+        chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), total.node[first][3])
         if k == model.first_flagellum[c]:
+            b = w * last.body[c] + whole * (found.body[c] + x.body[c])
+            total.body[c] = b
+            rest.body[c] = b - ahead * last.body[c] - found.body[c]
             chart.commit[c] = 1  # the guards look at this pose
-            b = real(imp.ratio[c]) * last.body[c] + x.body[c]
             chart.body_increment[c] = vec6d(
                 wp.float64(b[0]),
                 wp.float64(b[1]),
@@ -228,20 +278,6 @@ def kernels(p: Precision) -> SimpleNamespace:
                 wp.float64(b[4]),
                 wp.float64(b[5]),
             )
-        turn = real(imp.ratio[c]) * last.node[first][3] + x.node[first][3]
-        chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), turn)
-        total = real(0.0)
-        foreseen = real(0.0)
-        if imp.history[c] == 2:
-            e = first + 1
-            while e < model.first_node[k + 1]:
-                d = x.node[e] - predicted.node[e]  # third divided difference of the path
-                total += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-                p = predicted.node[e]
-                foreseen += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-                e += 1
-        imp.error[k] = total / real(12.0)
-        imp.predicted[k] = foreseen
 
     @wp.kernel(module=module)
     def decide(
@@ -262,17 +298,16 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         dt = control.step[c]
-        error = wp.float64(0.0)
+        missed = wp.float64(0.0)
         k = model.first_flagellum[c]
         foreseen = wp.float64(0.0)
         nodes = int(0)
         while k < model.first_flagellum[c + 1]:
-            error += wp.float64(imp.error[k])
+            missed += wp.float64(imp.missed[k])
             foreseen += wp.float64(imp.predicted[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
-        missed = wp.float64(12.0) * error
-        error = peak * error / wp.float64(nodes)
+        error = peak * missed / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
@@ -341,9 +376,9 @@ def kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(
         begin=begin,
         right_hand_side=right_hand_side,
-        add_increments=add_increments,
         predict=predict,
-        estimate_error=estimate_error,
+        take=take,
+        complete=complete,
         decide=decide,
         keep_elements=keep_elements,
         keep_bodies=keep_bodies,

@@ -17,7 +17,8 @@ from warpflag_kernels import banded, chain, correction
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
-SHARE = 0.65  # of kappa that the over-implicitness takes
+import os
+SHARE = float(os.environ.get("SHARE","0.65"))  # of kappa that the over-implicitness takes
 FALL = 0.97  # of it from one look to the next at least: a power iteration comes from below
 MOST = 5.0  # beyond, one correction leaves too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at

@@ -14,9 +14,10 @@ import warp as wp
 from warpflag_kernels.types import Precision
 
 LARGEST_GROWTH = 2.0  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
-REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
+REFUSED = float(__import__("os").environ.get("REF","25.0"))  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
-MEMORY = 5.0e-4  # of that mean [s]
+import os
+MEMORY = float(os.environ.get("MEM", "5.0e-4"))  # of that mean [s]
 FORGOTTEN = 0.02  # of that time: a mean of estimates that fade without new ones counts no longer
 JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
 SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below

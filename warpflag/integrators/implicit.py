@@ -61,7 +61,7 @@ class ImplicitStepper:
     def __init__(self, system: System, scenes: Sequence[Scene]) -> None:
         self._system = system
         model = system.model
-        self._free = dataclasses.replace(
+        self._contactless = dataclasses.replace(
             model, switches=dataclasses.replace(model.switches, steric=False, body_contact=False)
         )
         self._touches = model.switches.steric or model.switches.body_contact
@@ -72,19 +72,10 @@ class ImplicitStepper:
             return wp.zeros(max(count, 1), dtype=dtype, device=device)
 
         # Poses that share the arrays of the state and of the start of the step.
-        t, s, base = chain.types(p), system.state.data, system.chart
-        self._now, self._base, self._trial = t.Pose(), t.Pose(), t.Pose()
-        for name in ("position", "tangent", "director", "length"):
-            setattr(self._now, name, getattr(s, name))
-            setattr(self._trial, name, wp.zeros_like(getattr(s, name)))
-        for name in ("body_position", "body_orientation", "body_axis"):
-            setattr(self._now, name, getattr(s, name))
-            setattr(self._trial, name, wp.zeros_like(getattr(s, name)))
-        # The state in the pose in which contacts are looked for.
-        self._trial_state = dataclasses.replace(system.state, data=structs(p).State())
-        self._trial_state.data.assign(s)
+        t, now, base = chain.types(p), system.state.data, system.chart
+        self._now, self._base = t.Pose(), t.Pose()
         for name in t.Pose.vars:
-            setattr(self._trial_state.data, name, getattr(self._trial, name))
+            setattr(self._now, name, getattr(now, name))
         self._base.position, self._base.tangent = base.base_position, base.base_tangent
         self._base.director = base.base_director
         self._base.body_position, self._base.body_orientation = base.base_body_position, base.base_body_orientation
@@ -95,9 +86,9 @@ class ImplicitStepper:
             return x
 
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
-        self._carried, self._carried_before, self._total = (increment() for _ in range(3))
-        self._predicted, self._free_step, self._step = (increment() for _ in range(3))
-        self._drive, self._defect, self._scratch = (increment() for _ in range(3))
+        self._predicted, self._free, self._step, self._rest = (increment() for _ in range(4))
+        self._carried, self._found, self._carried_on, self._found_on = (increment() for _ in range(4))
+        self._way, self._total = increment(), increment()
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -120,11 +111,11 @@ class ImplicitStepper:
         self._law, self._flow = compliance.allocate(model, self._contacts), flow.allocate(model)
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
-        i.last_step, i.step_before, i.ratio = (zeros(cells, wp.float64) for _ in range(3))
+        i.last_step, i.step_before, i.ratio, i.reach = (zeros(cells, wp.float64) for _ in range(4))
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
         i.history, i.accepted, i.evaluations = (zeros(cells, wp.int32) for _ in range(3))
-        i.error, i.predicted = zeros(flagella, p.real), zeros(flagella, p.real)
-        i.trust = zeros(cells, wp.float64)
+        i.missed, i.predicted = zeros(flagella, p.real), zeros(flagella, p.real)
+        i.trust, i.lead, i.beyond = (zeros(cells, wp.float64) for _ in range(3))
         self.data = i
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
@@ -144,39 +135,34 @@ class ImplicitStepper:
         law = self._contacts, self._law
         inputs = [model.data, state.data, s.control, self.steps, i, band, *law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
-        carry = (self._last, self._before, self._carried, self._carried_before)
-        chain.retract(model, state, self._base, i.ratio, self._last, self._now, carry)
-        inputs = [model.data, state.data, i, self._carried, self._carried_before, self._predicted]
+        # The first iteration, where the last steps lead.
+        inputs = [model.data, state.data, i, self._last, self._before, self._predicted, self._found, self._way]
         wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
+        carry = (self._last, self._found, self._carried, self._found_on)
+        chain.retract(model, state, self._base, i.one, self._way, self._now, carry)
         if self._touches:
-            chain.retract(model, state, self._now, i.trust, self._predicted, self._trial)
-            contact_search.find(model, self._trial_state, self._trial, self._contacts)
-            contact_law.press(model, state, i.trust, self._predicted, self._contacts, self._law)
+            contact_search.find(model, state, self._now, self._contacts)
+            contact_law.press(model, state, i.beyond, self._predicted, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)
         self._right_hand_side()
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
-        inputs = [model.data, state.data, i, band, self._law, self._carried]
-        inputs += [self._free_step, self._drive]
-        wp.launch(k.right_hand_side, model.element_count, inputs=inputs, device=device)
-        banded.solve(model, state, band, self._free_step)
-        x = self._free_step
-        if self._touches:
-            x = self._step
-            contact_law.solve(
-                model, state, self._contacts, band, self._flow, self._free_step, self._law, x, coarse=ROUGH
-            )  # fmt: skip
-        correction.correct(
-            model, state, self._stiffness, band, self._contacts, self._flow, self._law,
-            self._drive, x, self._defect, self._scratch,
-        )  # fmt: skip
-        inputs = [model.data, state.data, i, band, self._carried, self._predicted, x, s.chart]
-        wp.launch(k.estimate_error, model.flagellum_count, inputs=inputs, device=device)
-        inputs = [model.data, state.data, i, self._carried, x, self._total]
-        wp.launch(k.add_increments, model.element_count, inputs=inputs, device=device)
-        carry = (self._total, self._carried, self._next_last, self._next_before)
+        x = self._solve(self._carried, self._found_on, ROUGH)
+        # The second, where the first one led.
+        inputs = [model.data, state.data, x, self._found_on]
+        wp.launch(k.take, model.element_count, inputs=inputs, device=device)
+        carry = (self._carried, self._found_on, self._carried_on, self._found)
         chain.retract(model, state, self._now, i.one, x, self._now, carry)
+        if self._touches:
+            contact_search.renew(model, state, self._now, self._contacts)
+        self._right_hand_side()
+        x = self._solve(self._carried_on, self._found)
+        inputs = [model.data, state.data, i, self._carried_on, self._found, self._predicted, x]
+        inputs += [self._total, self._rest, s.chart]
+        wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
+        carry = (self._total, self._carried_on, self._next_last, self._next_before)
+        chain.retract(model, state, self._now, i.one, self._rest, self._now, carry)
         guard.check(model, state, s.chart, s.guard, s.control)
         inputs = [model.data, state.data, band, *law, s.chart, s.control, self.steps, i]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
@@ -193,19 +179,38 @@ class ImplicitStepper:
         control.count_pass(s.control, device)
 
     def _right_hand_side(self) -> None:
-        """Velocities at the extrapolated pose, with the contact forces that the list holds."""
+        """Velocities at the present pose, with the contact forces found so far."""
         model, state = self._system.model, self._system.state
         elastic.joint_gradients(model, state)
-        forces.total_forces(self._free, state)
+        forces.total_forces(self._contactless, state)
         if self._touches:
             contacts.act(model, state, self._contacts, self._law.force)
         body.body_motion(model, state)
         mobility.node_velocities(model, state)
 
+    def _solve(self, last: Any, found: Any, coarse: float = 1.0) -> Any:
+        """The increment that is still missing at the present pose.
+
+        Args:
+            last, found: the last increment, and what has been found of this one, carried to it.
+            coarse: how many times their tolerance is enough for the gaps.
+        """
+        model, state, law = self._system.model, self._system.state, self._law
+        inputs = [model.data, state.data, self.data, self._band, law, last, found, self._free]
+        kernel = implicit.kernels(model.precision).right_hand_side
+        wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
+        banded.solve(model, state, self._band, self._free)
+        if not self._touches:
+            return self._free
+        contact_law.solve(
+            model, state, self._contacts, self._band, self._flow, self._free, law, self._step, coarse=coarse
+        )
+        return self._step
+
     def _measure_stability(self) -> None:
         model, state = self._system.model, self._system.state
         stability.measure(
-            model, state, self._stiffness, self._band, self._flow, self._law, self._nothing, self._defect,
+            model, state, self._stiffness, self._band, self._flow, self._law, self._nothing, self._rest,
             self.stability, self.data.over_implicit,
         )  # fmt: skip
 
