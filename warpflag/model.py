@@ -148,7 +148,8 @@ def build_state(model: DeviceModel) -> DeviceState:
     if model.switches.steric:
         near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
         near.left, near.stale = zeros(flagella, wp.int32), zeros(cells, wp.int32)
-        near.longest = zeros(flagella, p.real)
+        near.x, near.y, near.z, near.half = (zeros(elements + neighbours.BLOCK, wp.float32) for _ in range(4))
+        near.extent = zeros(flagella, p.real)
         near.count, near.earlier = zeros(elements, wp.int32), zeros(elements, wp.int32)
         near.segment = zeros(elements * neighbours.SLOTS, wp.int32)
     return DeviceState(s, pairs, near)

@@ -17,6 +17,39 @@ CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [si
 SKIN = 0.1  # [um]
 SLOTS = 64  # segments that a list holds
 SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
+BLOCK = 16  # segments that a CPU asks at once
+
+# Segments [begin, end) of one flagellum that are near (x, y, z), listed in ascending order; returns how many the list
+# then names. A CPU asks a block of them at once: a bit for each that is near. What a block reads beyond `end` is
+# masked, and lies within the arrays, which are a block longer than there are segments.
+_LIST = """
+    const float* __restrict__ X = near.x.data; const float* __restrict__ Y = near.y.data;
+    const float* __restrict__ Z = near.z.data; const float* __restrict__ H = near.half.data;
+    int* S = near.segment.data + list;
+    #ifdef __CUDACC__
+    for (int j = begin; j < end; ++j) {
+        const float dx = x - X[j], dy = y - Y[j], dz = z - Z[j], reach = within + H[j];
+        if (dx * dx + dy * dy + dz * dz < reach * reach) {
+            if (found < SLOTS) S[found] = j;
+            ++found;
+        }
+    }
+    #else
+    for (int b = begin; b < end; b += BLOCK) {
+        unsigned hits = 0;
+        for (int l = 0; l < BLOCK; ++l) {
+            const float dx = x - X[b + l], dy = y - Y[b + l], dz = z - Z[b + l], reach = within + H[b + l];
+            hits |= (unsigned)(dx * dx + dy * dy + dz * dz < reach * reach) << l;
+        }
+        if (end - b < BLOCK) hits &= (1u << (end - b)) - 1u;
+        for (; hits; hits &= hits - 1) {
+            if (found < SLOTS) S[found] = b + __builtin_ctz(hits);
+            ++found;
+        }
+    }
+    #endif
+    return found;
+""".replace("SLOTS", str(SLOTS)).replace("BLOCK", str(BLOCK))
 
 
 @functools.cache
@@ -99,25 +132,50 @@ def lists(p: Precision) -> SimpleNamespace:
     """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
     real = p.real
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
-    middle, next_near = functions(p).middle, functions(p).next_near
+    middle = functions(p).middle
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
+    # Lengths hardly change; what they do is in the skin, like what the nodes move. So is what float32 leaves of a
+    # place.
+    half_share = wp.constant(real(0.55))
     module = p.module("neighbours_functions")
+
+    @wp.func_native(_LIST)
+    def list_some(
+        near: Neighbours,
+        list: wp.int32,
+        found: wp.int32,
+        begin: wp.int32,
+        end: wp.int32,
+        x: wp.float32,
+        y: wp.float32,
+        z: wp.float32,
+        within: wp.float32,
+    ) -> int: ...
 
     @wp.func(module=module)
     def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
-        """1: a node of flagellum k has moved by more than half the skin; else 0. Also finds its longest segment."""
+        """1: a node of flagellum k has moved by more than half the skin; else 0. Also notes where its segments are."""
         left = int(0)
-        longest = real(0.0)
-        e = model.first_node[k]
-        while e < model.first_node[k + 1]:
+        begin = model.first_node[k]
+        end = model.first_node[k + 1]
+        centre = state.position[(begin + end) / 2]
+        widest = real(0.0)
+        e = begin
+        while e < end:
             d = state.position[e] - near.position[e]
             if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
                 left = 1
-            if e > model.first_node[k]:
-                longest = wp.max(longest, state.length[e])
+            if e > begin:
+                x = middle(state, e)
+                half = half_share * state.length[e]
+                near.x[e] = wp.float32(x[0])
+                near.y[e] = wp.float32(x[1])
+                near.z[e] = wp.float32(x[2])
+                near.half[e] = wp.float32(half)
+                widest = wp.max(widest, wp.length(x - centre) + half)
             e += 1
-        near.longest[k] = longest
+        near.extent[k] = widest
         return left
 
     @wp.func(module=module)
@@ -128,21 +186,21 @@ def lists(p: Precision) -> SimpleNamespace:
         found = int(0)
         if e > model.first_node[own]:
             x = middle(state, e)
-            beyond = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e]
+            within = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e] + skin
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
                 if k == own:
                     near.earlier[e] = found
-                j = model.first_node[k] + 1
-                end = model.first_node[k + 1]
-                while j < end and k != own:
-                    distance = wp.length(x - middle(state, j))
-                    # Lengths hardly change; what they do is in the skin, like what the nodes move.
-                    if distance < beyond + skin + real(0.55) * state.length[j]:
-                        if found < slots:
-                            near.segment[e * slots + found] = j
-                        found += 1
-                    j = next_near(near.longest[k], j, distance, beyond + skin)
+                else:
+                    begin = model.first_node[k]
+                    end = model.first_node[k + 1]
+                    away = x - state.position[(begin + end) / 2]
+                    reach = within + near.extent[k]
+                    if wp.dot(away, away) < reach * reach:
+                        found = list_some(
+                            near, e * slots, found, begin + 1, end,
+                            wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]), wp.float32(within),
+                        )  # fmt: skip
                 k += 1
         near.count[e] = wp.where(found <= slots, found, -1)
 
@@ -154,6 +212,7 @@ def lists(p: Precision) -> SimpleNamespace:
         while k < model.first_flagellum[c + 1]:
             stale = wp.max(stale, has_left(model, state, near, k))
             k += 1
+        near.stale[c] = stale
         if stale == 0:
             return
         e = model.first_node[model.first_flagellum[c]]
@@ -167,7 +226,7 @@ def lists(p: Precision) -> SimpleNamespace:
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
-    has_left, list_near = lists(p).has_left, lists(p).list_near
+    has_left, list_near, refresh_cell = lists(p).has_left, lists(p).list_near, lists(p).refresh_cell
     module = p.module("neighbours")
 
     @wp.kernel(module=module)
@@ -211,13 +270,27 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if near.stale[c] != 0:
             list_near(model, state, near, e, c)
 
-    return SimpleNamespace(measure=measure, judge=judge, build=build)
+    @wp.kernel(module=module)
+    def refresh_cells(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        refresh_cell(model, state, near, wp.tid())
+
+    return SimpleNamespace(measure=measure, judge=judge, build=build, refresh_cells=refresh_cells)
 
 
 def refresh(model: DeviceModel, state: DeviceState) -> None:
     """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
     kernels, near, device = _kernels(model.precision), state.neighbours, model.device
     inputs = [model.data, state.data, near]
+    if model.one_thread_per_cell:
+        wp.launch(kernels.refresh_cells, model.cell_count, inputs=inputs, device=device)
+        return
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.judge, model.cell_count, inputs=[model.data, near], device=device)
     wp.launch(kernels.build, model.element_count, inputs=inputs, device=device)

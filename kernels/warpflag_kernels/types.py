@@ -164,7 +164,12 @@ def structs(p: Precision) -> SimpleNamespace:
     class Neighbours:
         position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
         left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
-        longest: wp.array(dtype=real)  # [K], segment when that was last asked [um]
+        # When that was last asked; [E + BLOCK] midpoints of segments and half their lengths, a tenth added.
+        x: wp.array(dtype=wp.float32)  # [um]
+        y: wp.array(dtype=wp.float32)
+        z: wp.array(dtype=wp.float32)
+        half: wp.array(dtype=wp.float32)
+        extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
         stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
         earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
