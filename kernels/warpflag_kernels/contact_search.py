@@ -27,32 +27,40 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     candidates, candidate, first_later, beside = (
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
     )  # fmt: skip
-    all_slots = wp.constant(neighbours.SLOTS)
+    all_slots, all_asked = wp.constant(neighbours.SLOTS), wp.constant(wp.uint64(2**64 - 1))
     reach_factor = real(steric.CUTOFF + MARGIN)
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
-    def visit(model: Model, pose: Pose, near: Neighbours, listed: Contacts, e: wp.int32, write: wp.int32):
-        """Contacts that belong to element e: with segments of later flagella, and with the body."""
+    def visit(
+        model: Model,
+        pose: Pose,
+        near: Neighbours,
+        listed: Contacts,
+        e: wp.int32,
+        start: wp.int32,
+        room: wp.int32,
+        asked: wp.uint64,
+    ):
+        """Contacts that belong to element e, with segments of later flagella and with the body, recorded from `start`
+        as far as there is room; how many there are, and a bit for each candidate that is one. Of a list's candidates
+        those `asked` are looked at, of a longer one's all."""
         k = model.flagellum_of[e]
         c = model.cell_of[e]
         reach = reach_factor * model.steric_diameter[c]
         found = int(0)
+        seen = wp.uint64(0)
         q1 = pose.position[e]
         if wp.static(segments):
             p1 = pose.position[e - 1]
             middle = real(0.5) * (p1 + q1)
             own_reach = real(0.5) * pose.length[e] + reach
             n = candidates(model, near, e)
-            seen = wp.uint64(0)  # which candidates are contacts; those of a longer list are looked at twice
-            if write >= 0 and n <= all_slots:
-                seen = listed.found[e]
             entry = first_later(model, near, e)
             bit = wp.uint64(1)
             while entry < n:
                 j = candidate(model, near, e, entry)
-                skipped = write >= 0 and n <= all_slots and (seen & bit) == wp.uint64(0)
-                if j >= 0 and not skipped:
+                if j >= 0 and (n > all_slots or (asked & bit) != wp.uint64(0)):
                     p2 = pose.position[j - 1]
                     q2 = pose.position[j]
                     away = middle - real(0.5) * (p2 + q2)
@@ -64,8 +72,8 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                         at, at_other, apart = nearest(p1, q1, p2, q2)
                         r = wp.length(apart)
                         if r < reach:
-                            if write >= 0:
-                                i = write + found
+                            if found < room:
+                                i = start + found
                                 listed.segment[i] = e
                                 listed.other[i] = j
                                 listed.at[i] = at
@@ -80,16 +88,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                             seen = seen | bit
                 entry += 1
                 bit = bit << wp.uint64(1)
-            if write < 0:
-                listed.found[e] = seen
         if wp.static(body):
             axis = pose.body_axis[c]
             half = model.body_half_length[c]
             away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
             distance = wp.length(away_from_axis)
             if distance - model.body_radius[c] < reach:
-                if write >= 0:
-                    i = write + found
+                if found < room:
+                    i = start + found
                     listed.segment[i] = e
                     listed.other[i] = -1
                     listed.at[i] = real(1.0)
@@ -97,7 +103,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     listed.gap[i] = distance - model.body_radius[c]
                     listed.normal[i] = away_from_axis / distance
                 found += 1
-        return found
+        return found, seen
 
     @wp.kernel(module=module)
     def count(
@@ -115,7 +121,9 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             return
         listed.stop[e] = 0
         if e > model.first_node[model.flagellum_of[e]]:
-            listed.stop[e] = visit(model, pose, near, listed, e, -1)
+            found, seen = visit(model, pose, near, listed, e, 0, 0, all_asked)
+            listed.stop[e] = found
+            listed.found[e] = seen
 
     @wp.kernel(module=module)
     def sum_up(
@@ -157,7 +165,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     ):
         e = wp.tid()
         if state.active[model.cell_of[e]] != 0 and listed.stop[e] > listed.start[e]:
-            visit(model, pose, near, listed, e, listed.start[e])
+            visit(model, pose, near, listed, e, listed.start[e], listed.stop[e] - listed.start[e], listed.found[e])
 
     @wp.kernel(module=module)
     def link(
@@ -198,6 +206,57 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         listed.body_head[k] = head
 
     @wp.kernel(module=module)
+    def list_cells(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        pose: Pose,
+        near: Neighbours,
+        # Out:
+        listed: Contacts,
+    ):
+        """All of that for a cell at once."""
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        begin = listed.first[c]
+        i = int(begin)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k]
+            end = model.first_node[k + 1]
+            listed.start[e] = i
+            listed.stop[e] = i
+            listed.head[e] = -1
+            e += 1
+            while e < end:
+                room = listed.first[c + 1] - i
+                found, _seen = visit(model, pose, near, listed, e, i, room, all_asked)
+                if found > room:
+                    listed.overflow[c] = 1
+                    found = 0
+                listed.start[e] = i
+                i += found
+                listed.stop[e] = i
+                listed.head[e] = -1
+                e += 1
+            listed.body_head[k] = -1
+            k += 1
+        listed.count[c] = i - begin
+        i -= 1
+        while i >= begin:
+            j = listed.other[i]
+            if j >= 0:
+                listed.next[i] = listed.head[j]
+                listed.head[j] = i
+            else:
+                k = model.flagellum_of[listed.segment[i]]
+                listed.next[i] = listed.body_head[k]
+                listed.body_head[k] = i
+            i -= 1
+
+    @wp.kernel(module=module)
     def renew(
         # Model:
         model: Model,
@@ -234,7 +293,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 listed.normal[i] = direction(apart, r, q1 - p1, q2 - p2, model.steric_diameter[c])
             i += 1
 
-    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, renew=renew)
+    return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, list_cells=list_cells, renew=renew)
 
 
 def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
@@ -247,6 +306,9 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
         neighbours.refresh(model, state)
     kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
     inputs, device = [model.data, state.data, pose, state.neighbours, contacts_out], model.device
+    if model.one_thread_per_cell:
+        wp.launch(kernels.list_cells, model.cell_count, inputs=inputs, device=device)
+        return
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.sum_up, model.cell_count, inputs=[model.data, state.data, contacts_out], device=device)
     wp.launch(kernels.fill, model.element_count, inputs=inputs, device=device)

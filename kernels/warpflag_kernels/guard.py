@@ -137,7 +137,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
     def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
         """Whether two segments pass through each other while their ends move linearly to the new places."""
         zero, one = real(0.0), real(1.0)
-        moved = wp.max(wp.length(p1n - p1), wp.length(q1n - q1)) + wp.max(wp.length(p2n - p2), wp.length(q2n - q2))
+        # No point of one has moved further against a point of the other than their ends have.
+        dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
+        moved = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
+        moved = wp.sqrt(wp.max(moved, wp.max(wp.length_sq(dp1 - dq2), wp.length_sq(dq1 - dp2))))
         if distance(p1n, q1n - p1n, p2n, q2n - p2n) > moved + touch:
             return False
         # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign

@@ -44,7 +44,8 @@ __all__ = ["ImplicitStepper"]
 
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
-ROUGH = 50.0
+import os
+ROUGH = float(os.environ.get("ROUGH", "50"))
 """How many times their tolerance is enough for gaps that only lead to the defect correction."""
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
