@@ -20,12 +20,10 @@ import warp as wp
 
 from warpflag_kernels import banded, chain, compliance, contacts, steric
 from warpflag_kernels import flow as flow_stage
-from warpflag_kernels.compliance import DIRECTIONS, LANES, meet, struct
+from warpflag_kernels.compliance import DIRECTIONS, LANES, SMALL, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
-LEAST_REDUCTION, MOST_REDUCTION = 0.1, 0.001  # of the linear residual, at which GMRES stops
-PATIENCE = 4  # iterations of Newton's method after which it does not stop early: contacts are very stiff
-ITERATIONS = 60  # of Newton's method
+ITERATIONS = 60
 HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
 SETTLED = 1.0e-3  # change at which a contact's own Newton iteration has converged, the next would be its square [sigma]
@@ -33,23 +31,25 @@ STIFFENING = 0.15  # of a contact's compliance from local drag, for what else ho
 DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
-# Dot products with earlier directions, and their removal, are a vector loop only where the compiler is told that
-# directions do not overlap.
+SAME = 1.0e-3  # share of a load that must be new for it to be learnt from
+
+# Sums over contacts are a vector loop only where the compiler is told that what they run over does not overlap.
 _DOT = """
-    const REAL* __restrict__ A = law.basis.data + a; const REAL* __restrict__ B = law.basis.data + b;
+    const REAL* __restrict__ A = a.data + i; const REAL* __restrict__ B = b.data + j;
+    const REAL* __restrict__ C = weight.data + k;
     REAL total = 0;
     #ifndef __CUDACC__
     #pragma clang loop vectorize(assume_safety)
     #endif
-    for (int i = lane; i < count; i += LANES) total += A[i] * B[i];
+    for (int n = lane; n < count; n += lanes) total += A[n] * B[n] * C[n];
     return total;
 """
 _REMOVE = """
-    REAL* __restrict__ A = law.basis.data + a; const REAL* __restrict__ B = law.basis.data + b;
+    REAL* __restrict__ A = a.data + i; const REAL* __restrict__ B = a.data + j;
     #ifndef __CUDACC__
     #pragma clang loop vectorize(assume_safety)
     #endif
-    for (int i = lane; i < count; i += LANES) A[i] -= share * B[i];
+    for (int n = lane; n < count; n += lanes) A[n] -= share * B[n];
 """
 
 
@@ -59,30 +59,30 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
     Flow, Increment = flow_stage.struct(p), chain.types(p).Increment
-    vecd = wp.types.vector(DIRECTIONS, real)
-    hessenberg = wp.types.matrix((DIRECTIONS + 1, DIRECTIONS), real)
-    rotations = wp.types.vector(DIRECTIONS + 1, real)
+    Reals = wp.array(dtype=real)
     steric_force, steric_law = steric.functions(p).steric_force, steric.functions(p).steric_law
     gap_change = contacts.functions(p).gap_change
     f = compliance.functions(p, pairs, form, lanes)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
     directions, iterations, halvings = wp.constant(DIRECTIONS), wp.constant(ITERATIONS), wp.constant(HALVINGS)
-    patience = wp.constant(PATIENCE)
+    same, small_size = wp.constant(real(SAME)), wp.constant(SMALL)
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
     cutoff, linear_below = wp.constant(real(steric.CUTOFF)), wp.constant(real(steric.LINEAR_BELOW))
     settled = wp.constant(real(SETTLED))
     infinite = wp.constant(real(3.0e38))
-    least_reduction, most_reduction = wp.constant(real(LEAST_REDUCTION)), wp.constant(real(MOST_REDUCTION))
     module = p.module("contact_law", f"{pairs}_{form}_{lanes}")
 
     def native(code: str) -> str:
-        return code.replace("REAL", {"float64": "double", "float32": "float"}[p.name]).replace("LANES", str(lanes))
+        return code.replace("REAL", {"float64": "double", "float32": "float"}[p.name])
 
     @wp.func_native(native(_DOT))
-    def dot_basis(law: Law, a: wp.int32, b: wp.int32, count: wp.int32, lane: wp.int32) -> real: ...
+    def dot(
+        a: Reals, i: wp.int32, b: Reals, j: wp.int32, weight: Reals, k: wp.int32,
+        count: wp.int32, lane: wp.int32, lanes: wp.int32,
+    ) -> real: ...  # fmt: skip
 
     @wp.func_native(native(_REMOVE))
-    def remove(law: Law, a: wp.int32, b: wp.int32, count: wp.int32, lane: wp.int32, share: real): ...
+    def remove(a: Reals, i: wp.int32, j: wp.int32, share: real, count: wp.int32, lane: wp.int32, lanes: wp.int32): ...
 
     @wp.kernel(module=module)
     def press(
@@ -177,6 +177,83 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             i += lanes
         return block_max(law, worst, c, lane), loaded
 
+    @wp.func(module=module)
+    def learn(law: Law, c: wp.int32, begin: wp.int32, count: wp.int32, capacity: wp.int32, lane: wp.int32):
+        """Takes the load and its answer into what is known of W: what is new of the load, of unit length, and what W
+        makes of it beyond the contacts' own compliance."""
+        known = law.known[c]
+        slot = known % directions
+        own = directions * begin
+        at = own + slot * capacity
+        i = lane
+        while i < count:
+            load = law.load[begin + i]
+            law.loads[at + i] = load
+            law.answers[at + i] = law.change[begin + i] - law.yielding[begin + i] * load
+            i += lanes
+        size = dot(law.loads, at, law.loads, at, law.yielding, begin, count, lane, lanes)
+        size = block_sum(law, size, c, lane)
+        m = int(0)
+        while m < wp.min(known, directions):
+            if m != slot:
+                other = own + m * capacity
+                share = dot(law.loads, at, law.loads, other, law.yielding, begin, count, lane, lanes)
+                share = block_sum(law, share, c, lane)
+                remove(law.loads, at, other, share, count, lane, lanes)
+                remove(law.answers, at, other, share, count, lane, lanes)
+            m += 1
+        left = dot(law.loads, at, law.loads, at, law.yielding, begin, count, lane, lanes)
+        left = block_sum(law, left, c, lane)
+        scale = real(0.0)
+        if left > same * same * size:
+            scale = real(1.0) / wp.sqrt(left)
+        i = lane
+        while i < count:
+            law.loads[at + i] = scale * law.loads[at + i]
+            law.answers[at + i] = scale * law.answers[at + i]
+            i += lanes
+        if lane == 0 and (scale > real(0.0) or known > slot):
+            law.known[c] = known + 1
+        meet()
+
+    @wp.func(module=module)
+    def solve_small(small: Reals, first: wp.int32, n: wp.int32):
+        """Solves the system of n unknowns that lies at `first`, row after row with its right-hand side, in place."""
+        width = n + 1
+        col = int(0)
+        while col < n:
+            best = int(col)
+            r = int(col) + 1
+            while r < n:
+                if wp.abs(small[first + r * width + col]) > wp.abs(small[first + best * width + col]):
+                    best = r
+                r += 1
+            j = int(col)
+            while j < width:
+                swap = small[first + col * width + j]
+                small[first + col * width + j] = small[first + best * width + j]
+                small[first + best * width + j] = swap
+                j += 1
+            scale = real(1.0) / small[first + col * width + col]
+            r = int(col) + 1
+            while r < n:
+                f = scale * small[first + r * width + col]
+                j = int(col) + 1
+                while j < width:
+                    small[first + r * width + j] = small[first + r * width + j] - f * small[first + col * width + j]
+                    j += 1
+                r += 1
+            col += 1
+        col = n - 1
+        while col >= 0:
+            value = small[first + col * width + n]
+            j = int(col) + 1
+            while j < n:
+                value -= small[first + col * width + j] * small[first + j * width + n]
+                j += 1
+            small[first + col * width + n] = value / small[first + col * width + col]
+            col -= 1
+
     @wp.kernel(module=module)
     def solve(
         # Model:
@@ -188,6 +265,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         flow: Flow,
         start: Increment,
         coarse: real,
+        forget: wp.bool,
         # Out:
         law: Law,
         x: Increment,
@@ -200,14 +278,15 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         begin = contacts_in.first[c]
         stop = begin + contacts_in.count[c]
         capacity = contacts_in.first[c + 1] - begin
-        own_basis = (directions + 1) * begin
-        own_moved = directions * begin
+        own = directions * begin
         tolerance = coarse * law.tolerance[c]
         i = begin + lane
         while i < stop:
             law.yielding[i] = own_compliance(model, contacts_in, i, stiffening * real(law.gain[c] * band.step[c]))
             law.free_gap[i] = contacts_in.gap[i] + gap_change(model, state, contacts_in, i, start)
             i += lanes
+        if forget and lane == 0:
+            law.known[c] = 0
         worst = real(0.0)
         loaded = real(0.0)
         before = infinite
@@ -217,119 +296,68 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
             worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, lane)
-            if worst <= tolerance:
-                going = 0
-            elif iteration > 0 and not (worst < before) and halving < halvings:
-                shortened = real(0.5) * shortened
-                halving += 1
-                i = lane
-                while i < stop - begin:
-                    law.solved_gap[begin + i] = law.solved_gap[begin + i] - shortened * law.basis[own_basis + i]
-                    i += lanes
-            elif iteration == iterations:
+            if worst <= tolerance or iteration == iterations or not (worst < infinite):
                 going = 0
             else:
-                # GMRES for u, from zero.
-                norm = real(0.0)
-                i = begin + lane
-                while i < stop:
-                    _force, k = steric_law(law.solved_gap[i], strength, diameter)
-                    root = wp.sqrt(k / (real(1.0) + k * law.yielding[i]))
-                    law.root[i] = root
-                    b = -root * law.residual[i]
-                    law.basis[own_basis + i - begin] = b
-                    norm += b * b
-                    i += lanes
-                norm = wp.sqrt(block_sum(law, norm, c, lane))
-                enough = most_reduction
-                if iteration < patience:
-                    enough = wp.clamp(real(0.5) * tolerance / worst, most_reduction, least_reduction)
-                h = hessenberg()
-                cosine = rotations()
-                sine = rotations()
-                right = rotations()
-                right[0] = norm
-                left = norm
-                n = int(0)
-                while n < directions and left > enough * norm:
-                    # The direction's length, then its product.
-                    at = own_basis + n * capacity
-                    size = norm
-                    if n > 0:
-                        size = h[n, n - 1]  # kept below the triangle
-                    scale = real(1.0) / size
-                    i = lane
-                    while i < stop - begin:
-                        v = scale * law.basis[at + i]
-                        law.basis[at + i] = v
-                        law.load[begin + i] = law.root[begin + i] * v
-                        i += lanes
-                    product(model, state, contacts_in, band, flow, law, c, lane)
-                    i = lane
-                    while i < stop - begin:
-                        change = law.change[begin + i]
-                        law.moved[own_moved + n * capacity + i] = change
-                        root = law.root[begin + i]
-                        scaled = real(1.0) - root * root * law.yielding[begin + i]
-                        law.basis[at + capacity + i] = scaled * law.basis[at + i] + root * change
-                        i += lanes
-                    m = int(0)
-                    while m <= n:
-                        other = own_basis + m * capacity
-                        dot = block_sum(law, dot_basis(law, other, at + capacity, stop - begin, lane), c, lane)
-                        remove(law, at + capacity, other, stop - begin, lane, dot)
-                        h[m, n] = dot
-                        m += 1
-                    size = dot_basis(law, at + capacity, at + capacity, stop - begin, lane)
-                    size = wp.sqrt(block_sum(law, size, c, lane))
-                    h[n + 1, n] = size
-                    # Givens rotations turn the Hessenberg matrix into a triangle.
-                    m = int(0)
-                    while m < n:
-                        a = h[m, n]
-                        b = h[m + 1, n]
-                        h[m, n] = cosine[m] * a + sine[m] * b
-                        h[m + 1, n] = cosine[m] * b - sine[m] * a
-                        m += 1
-                    a = h[n, n]
-                    length = wp.sqrt(a * a + size * size)
-                    cosine[n] = a / length
-                    sine[n] = size / length
-                    h[n, n] = length
-                    right[n + 1] = -sine[n] * right[n]
-                    right[n] = cosine[n] * right[n]
-                    left = wp.abs(right[n + 1])
-                    n += 1
-                y = vecd()
-                m = n - 1
-                while m >= 0:
-                    value = right[m]
-                    j = m + 1
-                    while j < n:
-                        value -= h[m, j] * y[j]
-                        j += 1
-                    y[m] = value / h[m, m]
-                    m -= 1
-                i = lane
-                while i < stop - begin:
-                    change = -law.residual[begin + i]
-                    m = int(0)
-                    while m < n:
-                        change -= y[m] * law.moved[own_moved + m * capacity + i]
-                        m += 1
-                    gap = law.solved_gap[begin + i]
-                    compliance = law.yielding[begin + i]
-                    force, k = steric_law(gap, strength, diameter)
-                    alone = gap - compliance * force + (real(1.0) + compliance * k) * change
-                    change = settle(alone, compliance, strength, diameter, gap + change) - gap
-                    # Kept, should the step have to be shortened.
-                    law.basis[own_basis + i] = change
-                    law.solved_gap[begin + i] = gap + change
-                    i += lanes
-                before = worst
-                shortened = real(1.0)
-                halving = 0
                 iteration += 1
+                if loaded > real(0.0):
+                    learn(law, c, begin, stop - begin, capacity, lane)
+                if not (worst < before) and halving < halvings:
+                    shortened = real(0.5) * shortened
+                    halving += 1
+                    i = begin + lane
+                    while i < stop:
+                        law.solved_gap[i] = law.solved_gap[i] - shortened * law.taken[i]
+                        i += lanes
+                else:
+                    i = begin + lane
+                    while i < stop:
+                        _force, k = steric_law(law.solved_gap[i], strength, diameter)
+                        compliance = law.yielding[i]
+                        w = compliance * k / (real(1.0) + compliance * k)
+                        law.share[i] = w
+                        i += lanes
+                    meet()
+                    n = wp.min(law.known[c], directions)
+                    first = c * small_size
+                    entry = int(lane)
+                    while entry < n * (n + 1):
+                        row = own + (entry / (n + 1)) * capacity
+                        column = entry % (n + 1)
+                        value = real(0.0)
+                        if column < n:
+                            value = dot(
+                                law.loads, row, law.answers, own + column * capacity, law.share, begin,
+                                stop - begin, 0, 1,
+                            )  # fmt: skip
+                            if column == entry / (n + 1):
+                                value += real(1.0)
+                        else:
+                            value = dot(law.loads, row, law.residual, begin, law.share, begin, stop - begin, 0, 1)
+                        law.small[first + entry] = value
+                        entry += lanes
+                    meet()
+                    if lane == 0:
+                        solve_small(law.small, first, n)
+                    meet()
+                    i = begin + lane
+                    while i < stop:
+                        change = -law.residual[i]
+                        m = int(0)
+                        while m < n:
+                            change += law.small[first + m * (n + 1) + n] * law.answers[own + m * capacity + i - begin]
+                            m += 1
+                        gap = law.solved_gap[i]
+                        compliance = law.yielding[i]
+                        force, k = steric_law(gap, strength, diameter)
+                        guess = gap + change / (real(1.0) + compliance * k)
+                        change = settle(gap - compliance * force + change, compliance, strength, diameter, guess) - gap
+                        law.taken[i] = change  # should it have to be shortened
+                        law.solved_gap[i] = gap + change
+                        i += lanes
+                    before = worst
+                    shortened = real(1.0)
+                    halving = 0
         if lane == 0 and not (worst <= tolerance):
             law.failed[c] = 1
         meet()
@@ -376,6 +404,7 @@ def solve(
     law: Any,
     out: Any,
     coarse: float = 1.0,
+    forget: bool = True,
 ) -> None:
     """Forces and gaps of the contacts, and the increment with them; `failed` tells of a cell without a solution.
 
@@ -385,9 +414,10 @@ def solve(
         start: increment with the forces that act, before the contacts answer to it.
         out: increment with their answer, `start` + Y (F - acting).
         coarse: how many times the tolerance is enough.
+        forget: whether what is known of W is of other contacts.
     """
     lanes = _lanes(model)
-    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, law, out]
+    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, forget, law, out]
     kernel = _kernels_of(model).solve
     wp.launch(kernel, (model.cell_count, lanes), inputs=inputs, device=model.device, block_dim=lanes)
 

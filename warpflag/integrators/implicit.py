@@ -204,7 +204,7 @@ class ImplicitStepper:
         if not self._touches:
             return self._free
         contact_law.solve(
-            model, state, self._contacts, self._band, self._flow, self._free, law, self._step, coarse=coarse
+            model, state, self._contacts, self._band, self._flow, self._free, law, self._step, coarse, coarse > 1.0
         )
         return self._step
 
