@@ -18,8 +18,6 @@ from warpflag_kernels import flow as flow_stage
 from warpflag_kernels.types import DeviceModel, Precision, structs
 
 LANES = 128  # threads of a block on CUDA
-DIRECTIONS = 16  # loads whose answers are kept at most
-SMALL = DIRECTIONS * (DIRECTIONS + 1)
 
 
 @wp.func_native("WP_TILE_SYNC();")
@@ -44,11 +42,11 @@ def struct(p: Precision) -> Any:
         load: wp.array(dtype=real)  # what W is applied to [pN]
         change: wp.array(dtype=real)  # W load [um]
         yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
-        share: wp.array(dtype=real)  # of a change of the gap that this compliance and the stiffness take out
+        share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `yielding` alone
         taken: wp.array(dtype=real)  # last change of the solved gap [um]
-        # What is known of W: loads of unit length, and what it makes of them beyond `yielding` [DIRECTIONS * capacity].
-        loads: wp.array(dtype=real)
-        answers: wp.array(dtype=real)
+        # What is known of W, see `secant`: loads of unit length, and their answers beyond `yielding`.
+        loads: wp.array(dtype=real)  # [KEPT * capacity]
+        answers: wp.array(dtype=real)  # [KEPT * capacity]
         # Per element [E], flagellum [K], lane [C * LANES].
         on_first: wp.array(dtype=vec3)  # of segment i [pN]
         on_second: wp.array(dtype=vec3)
@@ -59,8 +57,8 @@ def struct(p: Precision) -> Any:
         # Per cell [C].
         gain: wp.array(dtype=wp.float64)  # g
         tolerance: wp.array(dtype=real)  # of a gap [um]
-        known: wp.array(dtype=wp.int32)  # how many loads there have been
-        small: wp.array(dtype=real)  # [C * SMALL], the system of their shares
+        small: wp.array(dtype=real)  # [C * SMALL], the system of the shares of known loads
+        known: wp.array(dtype=wp.int32)  # how many of these there have been
         products: wp.array(dtype=wp.int32)  # with W, so far
         failed: wp.array(dtype=wp.int32)  # 1: not solved
 
@@ -78,8 +76,6 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
     law = struct(p)()
     for name in ("free_gap", "solved_gap", "residual", "force", "load", "change", "yielding", "share", "taken"):
         setattr(law, name, zeros(total, p.real))
-    law.loads, law.answers = zeros(DIRECTIONS * total, p.real), zeros(DIRECTIONS * total, p.real)
-    law.known, law.small = zeros(cells, wp.int32), zeros(cells * SMALL, p.real)
     law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
     law.on_body = zeros(model.flagellum_count, vec6)
     law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)

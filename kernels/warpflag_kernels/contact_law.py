@@ -18,38 +18,63 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, compliance, contacts, steric
+from warpflag_kernels import banded, chain, compliance, contacts, secant, steric
 from warpflag_kernels import flow as flow_stage
-from warpflag_kernels.compliance import DIRECTIONS, LANES, SMALL, meet, struct
+from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 ITERATIONS = 60
 HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
-SETTLED = 1.0e-3  # change at which a contact's own Newton iteration has converged, the next would be its square [sigma]
-STIFFENING = 0.15  # of a contact's compliance from local drag, for what else holds it
+SETTLING = 5  # iterations of a contact's own equation
+STIFFENING = 0.25  # of a contact's compliance from local drag, for what else holds it
 DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
-SAME = 1.0e-3  # share of a load that must be new for it to be learnt from
 
-# Sums over contacts are a vector loop only where the compiler is told that what they run over does not overlap.
-_DOT = """
-    const REAL* __restrict__ A = a.data + i; const REAL* __restrict__ B = b.data + j;
-    const REAL* __restrict__ C = weight.data + k;
+# Forces at the solved gaps beyond those that act, and how stiff they are; returns whether there are any.
+_LOAD = """
+    LAW
+    const REAL* __restrict__ G = law_in.solved_gap.data; const REAL* __restrict__ F = law_in.force.data;
+    const REAL* __restrict__ Y = law_in.yielding.data;
+    REAL* __restrict__ L = law_in.load.data; REAL* __restrict__ S = law_in.share.data;
     REAL total = 0;
     #ifndef __CUDACC__
     #pragma clang loop vectorize(assume_safety)
     #endif
-    for (int n = lane; n < count; n += lanes) total += A[n] * B[n] * C[n];
+    for (int i = begin + lane; i < stop; i += LANES) {
+        REAL f, k;
+        law(G[i], strength, diameter, f, k);
+        L[i] = f - F[i];
+        S[i] = Y[i] * k / (1 + Y[i] * k);
+        total += L[i] * L[i];
+    }
     return total;
 """
-_REMOVE = """
-    REAL* __restrict__ A = a.data + i; const REAL* __restrict__ B = a.data + j;
+# New gaps, each of which settles against its own compliance alone. What is left of its equation is concave: Newton's
+# method overshoots from above once, from below it rises to the solution.
+_SETTLE = """
+    LAW
+    REAL* __restrict__ G = law_in.solved_gap.data; REAL* __restrict__ T = law_in.taken.data;
+    const REAL* __restrict__ L = law_in.load.data; const REAL* __restrict__ F = law_in.force.data;
+    const REAL* __restrict__ Y = law_in.yielding.data; const REAL* __restrict__ S = law_in.share.data;
+    const REAL* __restrict__ C = law_in.change.data;
+    const REAL most = REAL(CUTOFF) * diameter, least = REAL(LINEAR) * diameter;
     #ifndef __CUDACC__
     #pragma clang loop vectorize(assume_safety)
     #endif
-    for (int n = lane; n < count; n += lanes) A[n] -= share * B[n];
+    for (int i = begin + lane; i < stop; i += LANES) {
+        const REAL gap = G[i], y = Y[i], alone = gap - y * (L[i] + F[i]) + C[i];
+        REAL g = gap + C[i] * (1 - S[i]), f, k;
+        g = g < least ? least : (g > most ? most : g);
+        for (int n = 0; n < SETTLING; ++n) {
+            law(g, strength, diameter, f, k);
+            g += (alone + y * f - g) / (1 + y * k);
+        }
+        g = alone >= most ? alone : g;
+        T[i] = g - gap;
+        G[i] = g;
+    }
 """
 
 
@@ -59,30 +84,26 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = banded.types(p).Band, contacts.struct(p), struct(p)
     Flow, Increment = flow_stage.struct(p), chain.types(p).Increment
-    Reals = wp.array(dtype=real)
-    steric_force, steric_law = steric.functions(p).steric_force, steric.functions(p).steric_law
+    steric_force = steric.functions(p).steric_force
     gap_change = contacts.functions(p).gap_change
     f = compliance.functions(p, pairs, form, lanes)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
-    directions, iterations, halvings = wp.constant(DIRECTIONS), wp.constant(ITERATIONS), wp.constant(HALVINGS)
-    same, small_size = wp.constant(real(SAME)), wp.constant(SMALL)
+    learn, combine = secant.functions(p, pairs, form, lanes).learn, secant.functions(p, pairs, form, lanes).combine
+    iterations, halvings = wp.constant(ITERATIONS), wp.constant(HALVINGS)
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
-    cutoff, linear_below = wp.constant(real(steric.CUTOFF)), wp.constant(real(steric.LINEAR_BELOW))
-    settled = wp.constant(real(SETTLED))
     infinite = wp.constant(real(3.0e38))
     module = p.module("contact_law", f"{pairs}_{form}_{lanes}")
 
-    def native(code: str) -> str:
-        return code.replace("REAL", {"float64": "double", "float32": "float"}[p.name])
+    def native(text: str) -> str:
+        return steric.code(p, text).replace("LANES", str(lanes)).replace("SETTLING", str(SETTLING))
 
-    @wp.func_native(native(_DOT))
-    def dot(
-        a: Reals, i: wp.int32, b: Reals, j: wp.int32, weight: Reals, k: wp.int32,
-        count: wp.int32, lane: wp.int32, lanes: wp.int32,
-    ) -> real: ...  # fmt: skip
+    @wp.func_native(native(_LOAD))
+    def load_all(
+        law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, lane: wp.int32
+    ) -> real: ...
 
-    @wp.func_native(native(_REMOVE))
-    def remove(a: Reals, i: wp.int32, j: wp.int32, share: real, count: wp.int32, lane: wp.int32, lanes: wp.int32): ...
+    @wp.func_native(native(_SETTLE))
+    def settle_all(law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, lane: wp.int32): ...
 
     @wp.kernel(module=module)
     def press(
@@ -121,23 +142,6 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         return time * weights * model.mobility_across[e]
 
     @wp.func(module=module)
-    def settle(s: real, compliance: real, strength: real, diameter: real, gap: real):
-        """The gap of a contact that yields alone, gap - compliance F(gap) = s, from an estimate of it."""
-        if s >= cutoff * diameter:
-            return s
-        # The left side is concave: Newton's method overshoots from above once, from below it rises to the solution.
-        gap = wp.clamp(gap, linear_below * diameter, cutoff * diameter)
-        i = int(0)
-        while i < 20:
-            force, stiffness = steric_law(gap, strength, diameter)
-            step = (s + compliance * force - gap) / (real(1.0) + compliance * stiffness)
-            gap += step
-            if wp.abs(step) < settled * diameter:
-                i = 20
-            i += 1
-        return gap
-
-    @wp.func(module=module)
     def evaluate(
         model: Model,
         state: State,
@@ -148,27 +152,18 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         c: wp.int32,
         lane: wp.int32,
     ):
-        """Residuals at the solved gaps; the largest."""
-        strength = model.steric_strength[c]
-        diameter = model.steric_diameter[c]
+        """Residuals at the solved gaps, the largest, and whether forces beyond those that act cause them."""
         begin = contacts_in.first[c]
         stop = begin + contacts_in.count[c]
-        loaded = real(0.0)
-        i = begin + lane
-        while i < stop:
-            load = steric_force(law.solved_gap[i], strength, diameter) - law.force[i]
-            law.load[i] = load
-            if load != real(0.0):
-                loaded = real(1.0)
-            i += lanes
-        loaded = block_max(law, loaded, c, lane)
-        if loaded > real(0.0):
+        loaded = load_all(law, begin, stop, model.steric_strength[c], model.steric_diameter[c], lane)
+        loaded = block_sum(law, loaded, c, lane)
+        if not (loaded == real(0.0)):
             product(model, state, contacts_in, band, flow, law, c, lane)
         worst = real(0.0)
         i = begin + lane
         while i < stop:
             r = law.solved_gap[i] - law.free_gap[i]
-            if loaded > real(0.0):
+            if not (loaded == real(0.0)):
                 r -= law.change[i]
             law.residual[i] = r
             if not wp.isfinite(r):
@@ -176,83 +171,6 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             worst = wp.max(worst, wp.abs(r))
             i += lanes
         return block_max(law, worst, c, lane), loaded
-
-    @wp.func(module=module)
-    def learn(law: Law, c: wp.int32, begin: wp.int32, count: wp.int32, capacity: wp.int32, lane: wp.int32):
-        """Takes the load and its answer into what is known of W: what is new of the load, of unit length, and what W
-        makes of it beyond the contacts' own compliance."""
-        known = law.known[c]
-        slot = known % directions
-        own = directions * begin
-        at = own + slot * capacity
-        i = lane
-        while i < count:
-            load = law.load[begin + i]
-            law.loads[at + i] = load
-            law.answers[at + i] = law.change[begin + i] - law.yielding[begin + i] * load
-            i += lanes
-        size = dot(law.loads, at, law.loads, at, law.yielding, begin, count, lane, lanes)
-        size = block_sum(law, size, c, lane)
-        m = int(0)
-        while m < wp.min(known, directions):
-            if m != slot:
-                other = own + m * capacity
-                share = dot(law.loads, at, law.loads, other, law.yielding, begin, count, lane, lanes)
-                share = block_sum(law, share, c, lane)
-                remove(law.loads, at, other, share, count, lane, lanes)
-                remove(law.answers, at, other, share, count, lane, lanes)
-            m += 1
-        left = dot(law.loads, at, law.loads, at, law.yielding, begin, count, lane, lanes)
-        left = block_sum(law, left, c, lane)
-        scale = real(0.0)
-        if left > same * same * size:
-            scale = real(1.0) / wp.sqrt(left)
-        i = lane
-        while i < count:
-            law.loads[at + i] = scale * law.loads[at + i]
-            law.answers[at + i] = scale * law.answers[at + i]
-            i += lanes
-        if lane == 0 and (scale > real(0.0) or known > slot):
-            law.known[c] = known + 1
-        meet()
-
-    @wp.func(module=module)
-    def solve_small(small: Reals, first: wp.int32, n: wp.int32):
-        """Solves the system of n unknowns that lies at `first`, row after row with its right-hand side, in place."""
-        width = n + 1
-        col = int(0)
-        while col < n:
-            best = int(col)
-            r = int(col) + 1
-            while r < n:
-                if wp.abs(small[first + r * width + col]) > wp.abs(small[first + best * width + col]):
-                    best = r
-                r += 1
-            j = int(col)
-            while j < width:
-                swap = small[first + col * width + j]
-                small[first + col * width + j] = small[first + best * width + j]
-                small[first + best * width + j] = swap
-                j += 1
-            scale = real(1.0) / small[first + col * width + col]
-            r = int(col) + 1
-            while r < n:
-                f = scale * small[first + r * width + col]
-                j = int(col) + 1
-                while j < width:
-                    small[first + r * width + j] = small[first + r * width + j] - f * small[first + col * width + j]
-                    j += 1
-                r += 1
-            col += 1
-        col = n - 1
-        while col >= 0:
-            value = small[first + col * width + n]
-            j = int(col) + 1
-            while j < n:
-                value -= small[first + col * width + j] * small[first + j * width + n]
-                j += 1
-            small[first + col * width + n] = value / small[first + col * width + col]
-            col -= 1
 
     @wp.kernel(module=module)
     def solve(
@@ -278,7 +196,6 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         begin = contacts_in.first[c]
         stop = begin + contacts_in.count[c]
         capacity = contacts_in.first[c + 1] - begin
-        own = directions * begin
         tolerance = coarse * law.tolerance[c]
         i = begin + lane
         while i < stop:
@@ -310,51 +227,8 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
                         law.solved_gap[i] = law.solved_gap[i] - shortened * law.taken[i]
                         i += lanes
                 else:
-                    i = begin + lane
-                    while i < stop:
-                        _force, k = steric_law(law.solved_gap[i], strength, diameter)
-                        compliance = law.yielding[i]
-                        w = compliance * k / (real(1.0) + compliance * k)
-                        law.share[i] = w
-                        i += lanes
-                    meet()
-                    n = wp.min(law.known[c], directions)
-                    first = c * small_size
-                    entry = int(lane)
-                    while entry < n * (n + 1):
-                        row = own + (entry / (n + 1)) * capacity
-                        column = entry % (n + 1)
-                        value = real(0.0)
-                        if column < n:
-                            value = dot(
-                                law.loads, row, law.answers, own + column * capacity, law.share, begin,
-                                stop - begin, 0, 1,
-                            )  # fmt: skip
-                            if column == entry / (n + 1):
-                                value += real(1.0)
-                        else:
-                            value = dot(law.loads, row, law.residual, begin, law.share, begin, stop - begin, 0, 1)
-                        law.small[first + entry] = value
-                        entry += lanes
-                    meet()
-                    if lane == 0:
-                        solve_small(law.small, first, n)
-                    meet()
-                    i = begin + lane
-                    while i < stop:
-                        change = -law.residual[i]
-                        m = int(0)
-                        while m < n:
-                            change += law.small[first + m * (n + 1) + n] * law.answers[own + m * capacity + i - begin]
-                            m += 1
-                        gap = law.solved_gap[i]
-                        compliance = law.yielding[i]
-                        force, k = steric_law(gap, strength, diameter)
-                        guess = gap + change / (real(1.0) + compliance * k)
-                        change = settle(gap - compliance * force + change, compliance, strength, diameter, guess) - gap
-                        law.taken[i] = change  # should it have to be shortened
-                        law.solved_gap[i] = gap + change
-                        i += lanes
+                    combine(law, c, begin, stop - begin, capacity, lane)
+                    settle_all(law, begin, stop, strength, diameter, lane)
                     before = worst
                     shortened = real(1.0)
                     halving = 0

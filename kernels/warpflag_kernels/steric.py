@@ -11,7 +11,6 @@ thread that does a whole cell takes every pair once for both sides instead, for 
 """
 
 import functools
-import math
 from types import SimpleNamespace
 
 import warp as wp
@@ -21,9 +20,27 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 CUTOFF = 2.0 ** (1.0 / 6.0)  # in units of sigma
 LINEAR_BELOW = 0.7
-_FORCE_THERE = 2.0 * LINEAR_BELOW**-13 - LINEAR_BELOW**-7  # in units of F_0
 _SLOPE_THERE = 26.0 * LINEAR_BELOW**-14 - 7.0 * LINEAR_BELOW**-8  # -dF/dr in units of F_0/sigma
-assert math.isclose(_FORCE_THERE, 194.3, rel_tol=1e-3)
+
+# The law without branches, so that loops over it can be vector code, and so that it says NaN to NaN.
+_LAW = """
+    const auto law = [](REAL r, REAL strength, REAL diameter, REAL& force, REAL& stiffness) {
+        const REAL x = r / diameter, below = REAL(LINEAR) - x;
+        const REAL y = 1 / (below > 0 ? REAL(LINEAR) : x), y2 = y * y, y6 = y2 * y2 * y2;
+        const bool open = x >= REAL(CUTOFF);
+        force = open ? 0 : strength * (y6 * y * (2 * y6 - 1) + (below > 0 ? REAL(SLOPE) * below : 0));
+        stiffness = open ? 0 : strength / diameter * (y6 * y2) * (26 * y6 - 7);
+    };
+"""
+
+
+def code(p: Precision, text: str) -> str:
+    """C++ in which LAW defines law(r, strength, diameter, force, stiffness), in this precision."""
+    words = {"LAW": _LAW, "LINEAR": repr(LINEAR_BELOW), "CUTOFF": repr(CUTOFF), "SLOPE": repr(_SLOPE_THERE)}
+    words["REAL"] = {"float64": "double", "float32": "float"}[p.name]
+    for word, meaning in words.items():
+        text = text.replace(word, meaning)
+    return text
 
 
 @functools.cache
@@ -31,29 +48,15 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions of contact: the force law and the closest points of two segments."""
     real, vec3 = p.real, p.vec3
     vec2 = wp.types.vector(2, real)
-    cutoff = real(CUTOFF)
-    linear_below, force_there, slope_there = real(LINEAR_BELOW), real(_FORCE_THERE), real(_SLOPE_THERE)
-
-    @wp.func(module=p.module("steric_functions"))
-    def steric_law(r: real, strength: real, diameter: real):
+    @wp.func_native(code(p, "LAW REAL f, k; law(r, strength, diameter, f, k); return {f, k};"))
+    def steric_law(r: real, strength: real, diameter: real) -> vec2:
         """Repulsion F [pN] and stiffness -dF/dr [pN/um] at distance r; r may be negative (a node below the surface)."""
-        x = r / diameter
-        if x >= cutoff:
-            return real(0.0), real(0.0)
-        stiffness = strength / diameter
-        if x < linear_below:
-            return strength * (force_there + slope_there * (linear_below - x)), stiffness * slope_there
-        y = real(1.0) / x
-        y3 = y * y * y
-        y6 = y3 * y3
-        force = strength * y6 * y * (real(2.0) * y6 - real(1.0))
-        return force, stiffness * y6 * (y * y) * (real(26.0) * y6 - real(7.0))
+        ...
 
-    @wp.func(module=p.module("steric_functions"))
-    def steric_force(r: real, strength: real, diameter: real):
+    @wp.func_native(code(p, "LAW REAL f, k; law(r, strength, diameter, f, k); return f;"))
+    def steric_force(r: real, strength: real, diameter: real) -> real:
         """Repulsion at distance r [pN]."""
-        force, _stiffness = steric_law(r, strength, diameter)
-        return force
+        ...
 
     @wp.func(module=p.module("steric_functions"))
     def closest_parameters(p1: vec3, d1: vec3, p2: vec3, d2: vec3):

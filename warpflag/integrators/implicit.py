@@ -27,6 +27,7 @@ from warpflag_kernels import (
     hessian,
     implicit,
     mobility,
+    secant,
     stability,
 )
 from warpflag_kernels.types import structs
@@ -110,6 +111,7 @@ class ImplicitStepper:
 
         self._contacts = contacts.allocate(model, self._touches)
         self._law, self._flow = compliance.allocate(model, self._contacts), flow.allocate(model)
+        secant.allocate(p, cells, len(self._contacts.gap), device, self._law)
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
         i.last_step, i.step_before, i.ratio, i.reach = (zeros(cells, wp.float64) for _ in range(4))
