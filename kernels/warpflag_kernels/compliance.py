@@ -40,10 +40,12 @@ def struct(p: Precision) -> Any:
         residual: wp.array(dtype=real)
         force: wp.array(dtype=real)  # what acts [pN]
         load: wp.array(dtype=real)  # what W is applied to [pN]
+        applied: wp.array(dtype=real)  # all that it has been applied to in a solution [pN]
+        answered: wp.array(dtype=real)  # and what that has changed [um]
         change: wp.array(dtype=real)  # W load [um]
         yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
         share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `yielding` alone
-        taken: wp.array(dtype=real)  # last change of the solved gap [um]
+        wanted: wp.array(dtype=real)  # change of the gap, less what it yields to its own force [um]
         # What is known of W, see `secant`: loads of unit length, and their answers beyond `yielding`.
         loads: wp.array(dtype=real)  # [KEPT * capacity]
         answers: wp.array(dtype=real)  # [KEPT * capacity]
@@ -74,7 +76,7 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
         return wp.zeros(count, dtype=dtype, device=model.device)
 
     law = struct(p)()
-    for name in ("free_gap", "solved_gap", "residual", "force", "load", "change", "yielding", "share", "taken"):
+    for name in ("free_gap", "solved_gap", "residual", "force", "load", "applied", "answered", "change", "yielding", "share"):
         setattr(law, name, zeros(total, p.real))
     law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
     law.on_body = zeros(model.flagellum_count, vec6)

@@ -24,19 +24,20 @@ from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 ITERATIONS = 60
-HALVINGS = 3
 FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
 SETTLING = 5  # iterations of a contact's own equation
 STIFFENING = 0.25  # of a contact's compliance from local drag, for what else holds it
+DEEP = 0.75  # a solution begins where such a contact would settle alone [sigma]
 DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]
 
 
 
-# Forces at the solved gaps beyond those that act, and how stiff they are; returns whether there are any.
+# What forces at the solved gaps differ by from those that W has been applied to, and how stiff they are; returns
+# whether they differ at all.
 _LOAD = """
     LAW
     const REAL* __restrict__ G = law_in.solved_gap.data; const REAL* __restrict__ F = law_in.force.data;
-    const REAL* __restrict__ Y = law_in.yielding.data;
+    const REAL* __restrict__ Y = law_in.yielding.data; const REAL* __restrict__ A = law_in.applied.data;
     REAL* __restrict__ L = law_in.load.data; REAL* __restrict__ S = law_in.share.data;
     REAL total = 0;
     #ifndef __CUDACC__
@@ -45,7 +46,7 @@ _LOAD = """
     for (int i = begin + lane; i < stop; i += LANES) {
         REAL f, k;
         law(G[i], strength, diameter, f, k);
-        L[i] = f - F[i];
+        L[i] = f - F[i] - A[i];
         S[i] = Y[i] * k / (1 + Y[i] * k);
         total += L[i] * L[i];
     }
@@ -55,25 +56,23 @@ _LOAD = """
 # method overshoots from above once, from below it rises to the solution.
 _SETTLE = """
     LAW
-    REAL* __restrict__ G = law_in.solved_gap.data; REAL* __restrict__ T = law_in.taken.data;
-    const REAL* __restrict__ L = law_in.load.data; const REAL* __restrict__ F = law_in.force.data;
+    REAL* __restrict__ G = law_in.solved_gap.data;
+    const REAL* __restrict__ A = law_in.applied.data; const REAL* __restrict__ F = law_in.force.data;
     const REAL* __restrict__ Y = law_in.yielding.data; const REAL* __restrict__ S = law_in.share.data;
-    const REAL* __restrict__ C = law_in.change.data;
-    const REAL most = REAL(CUTOFF) * diameter, least = REAL(LINEAR) * diameter;
+    const REAL* __restrict__ C = law_in.wanted.data;
+    const REAL most = (REAL)CUTOFF * diameter, least = (REAL)LINEAR * diameter;
     #ifndef __CUDACC__
     #pragma clang loop vectorize(assume_safety)
     #endif
     for (int i = begin + lane; i < stop; i += LANES) {
-        const REAL gap = G[i], y = Y[i], alone = gap - y * (L[i] + F[i]) + C[i];
+        const REAL gap = G[i], y = Y[i], alone = gap - y * (A[i] + F[i]) + C[i];
         REAL g = gap + C[i] * (1 - S[i]), f, k;
         g = g < least ? least : (g > most ? most : g);
         for (int n = 0; n < SETTLING; ++n) {
             law(g, strength, diameter, f, k);
             g += (alone + y * f - g) / (1 + y * k);
         }
-        g = alone >= most ? alone : g;
-        T[i] = g - gap;
-        G[i] = g;
+        G[i] = alone >= most ? alone : g;
     }
 """
 
@@ -89,7 +88,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     f = compliance.functions(p, pairs, form, lanes)
     block_sum, block_max, product = f.block_sum, f.block_max, f.product
     learn, combine = secant.functions(p, pairs, form, lanes).learn, secant.functions(p, pairs, form, lanes).combine
-    iterations, halvings = wp.constant(ITERATIONS), wp.constant(HALVINGS)
+    iterations, deep = wp.constant(ITERATIONS), wp.constant(real(DEEP))
     deepest, stiffening = wp.constant(real(DEEPEST)), wp.constant(real(STIFFENING))
     infinite = wp.constant(real(3.0e38))
     module = p.module("contact_law", f"{pairs}_{form}_{lanes}")
@@ -151,6 +150,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         law: Law,
         c: wp.int32,
         lane: wp.int32,
+        x: Increment,
     ):
         """Residuals at the solved gaps, the largest, and whether forces beyond those that act cause them."""
         begin = contacts_in.first[c]
@@ -159,12 +159,21 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         loaded = block_sum(law, loaded, c, lane)
         if not (loaded == real(0.0)):
             product(model, state, contacts_in, band, flow, law, c, lane)
+            e = model.first_node[model.first_flagellum[c]] + lane
+            while e < model.first_node[model.first_flagellum[c + 1]]:
+                x.node[e] = x.node[e] + law.answer.node[e]
+                e += lanes
+            if lane == 0:
+                x.body[c] = x.body[c] + law.answer.body[c]
+            i = begin + lane
+            while i < stop:
+                law.applied[i] = law.applied[i] + law.load[i]
+                law.answered[i] = law.answered[i] + law.change[i]
+                i += lanes
         worst = real(0.0)
         i = begin + lane
         while i < stop:
-            r = law.solved_gap[i] - law.free_gap[i]
-            if not (loaded == real(0.0)):
-                r -= law.change[i]
+            r = law.solved_gap[i] - law.free_gap[i] - law.answered[i]
             law.residual[i] = r
             if not wp.isfinite(r):
                 r = infinite  # a maximum would pass over what is not a number
@@ -183,7 +192,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         flow: Flow,
         start: Increment,
         coarse: real,
-        forget: wp.bool,
+        anew: wp.bool,
         # Out:
         law: Law,
         x: Increment,
@@ -201,37 +210,41 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         while i < stop:
             law.yielding[i] = own_compliance(model, contacts_in, i, stiffening * real(law.gain[c] * band.step[c]))
             law.free_gap[i] = contacts_in.gap[i] + gap_change(model, state, contacts_in, i, start)
+            law.applied[i] = real(0.0)
+            law.answered[i] = real(0.0)
             i += lanes
-        if forget and lane == 0:
-            law.known[c] = 0
+        e = model.first_node[model.first_flagellum[c]] + lane
+        while e < model.first_node[model.first_flagellum[c + 1]]:
+            x.node[e] = start.node[e]
+            e += lanes
+        if lane == 0:
+            x.body[c] = start.body[c]
+            if anew:
+                law.known[c] = 0
         worst = real(0.0)
         loaded = real(0.0)
-        before = infinite
-        shortened = real(1.0)
         iteration = int(0)
-        halving = int(0)
+        if anew:
+            # What overlaps deeply begins where it would settle alone: huge forces would leave their round-off behind.
+            load_all(law, begin, stop, strength, diameter, lane)
+            i = begin + lane
+            while i < stop:
+                law.wanted[i] = -law.yielding[i] * law.load[i]
+                if law.solved_gap[i] < deep * diameter:
+                    law.wanted[i] = law.free_gap[i] - law.solved_gap[i]
+                i += lanes
+            settle_all(law, begin, stop, strength, diameter, lane)
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
-            worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, lane)
+            worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, lane, x)
             if worst <= tolerance or iteration == iterations or not (worst < infinite):
                 going = 0
             else:
                 iteration += 1
                 if loaded > real(0.0):
                     learn(law, c, begin, stop - begin, capacity, lane)
-                if not (worst < before) and halving < halvings:
-                    shortened = real(0.5) * shortened
-                    halving += 1
-                    i = begin + lane
-                    while i < stop:
-                        law.solved_gap[i] = law.solved_gap[i] - shortened * law.taken[i]
-                        i += lanes
-                else:
-                    combine(law, c, begin, stop - begin, capacity, lane)
-                    settle_all(law, begin, stop, strength, diameter, lane)
-                    before = worst
-                    shortened = real(1.0)
-                    halving = 0
+                combine(law, c, begin, stop - begin, capacity, lane)
+                settle_all(law, begin, stop, strength, diameter, lane)
         if lane == 0 and not (worst <= tolerance):
             law.failed[c] = 1
         meet()
@@ -240,19 +253,6 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
             contacts_in.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
             i += lanes
-        e = model.first_node[model.first_flagellum[c]] + lane
-        end = model.first_node[model.first_flagellum[c + 1]]
-        while e < end:
-            moved = start.node[e]
-            if loaded > real(0.0):
-                moved += law.answer.node[e]
-            x.node[e] = moved
-            e += lanes
-        if lane == 0:
-            body_moved = start.body[c]
-            if loaded > real(0.0):
-                body_moved += law.answer.body[c]
-            x.body[c] = body_moved
 
     return SimpleNamespace(press=press, solve=solve)
 
@@ -278,7 +278,7 @@ def solve(
     law: Any,
     out: Any,
     coarse: float = 1.0,
-    forget: bool = True,
+    anew: bool = True,
 ) -> None:
     """Forces and gaps of the contacts, and the increment with them; `failed` tells of a cell without a solution.
 
@@ -288,10 +288,10 @@ def solve(
         start: increment with the forces that act, before the contacts answer to it.
         out: increment with their answer, `start` + Y (F - acting).
         coarse: how many times the tolerance is enough.
-        forget: whether what is known of W is of other contacts.
+        anew: whether these contacts are solved for the first time; else with what the last solution told of W.
     """
     lanes = _lanes(model)
-    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, forget, law, out]
+    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, anew, law, out]
     kernel = _kernels_of(model).solve
     wp.launch(kernel, (model.cell_count, lanes), inputs=inputs, device=model.device, block_dim=lanes)
 

@@ -22,7 +22,7 @@ from warpflag_kernels.types import Precision
 
 KEPT = 16  # loads at most; then each new one takes the place of the oldest
 SMALL = KEPT * (KEPT + 1)  # entries of the system of their shares
-SAME = 1.0e-3  # share of a load that must be new for it to be kept
+SAME = 0.1  # share of a load that must be new for it to be kept: what round-off makes of less misleads
 
 # Sums over contacts are a vector loop only where the compiler is told that what they run over does not overlap.
 _DOT = """
@@ -93,7 +93,7 @@ _SOLVE = """
             a[k * width + j] = a[best * width + j];
             a[best * width + j] = swap;
         }
-        const REAL scale = REAL(1) / a[k * width + k];
+        const REAL scale = (REAL)1 / a[k * width + k];
         for (int r = k + 1; r < n; ++r) {
             const REAL f = scale * a[r * width + k];
             for (int j = k + 1; j < width; ++j) a[r * width + j] -= f * a[k * width + j];
@@ -107,7 +107,7 @@ _SOLVE = """
 """
 # What the known loads leave to be changed: -residual and their shares of the answers.
 _CHANGE = """
-    REAL* __restrict__ C = law.change.data + begin; const REAL* __restrict__ R = law.residual.data + begin;
+    REAL* __restrict__ C = law.wanted.data + begin; const REAL* __restrict__ R = law.residual.data + begin;
     for (int i = lane; i < count; i += LANES) C[i] = -R[i];
     for (int m = 0; m < n; ++m) {
         const REAL* __restrict__ A = law.answers.data + own + m * capacity;
@@ -196,7 +196,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
 
     @wp.func(module=module)
     def combine(law: Law, c: wp.int32, begin: wp.int32, count: wp.int32, capacity: wp.int32, lane: wp.int32):
-        """What is to be added to a gap less what it yields to its own force, into `change`: from `residual` and
+        """What is to be added to a gap less what it yields to its own force, into `wanted`: from `residual` and
         `share`, of a change of a gap the part that its force takes back."""
         n = wp.min(law.known[c], kept)
         own = kept * begin
@@ -215,5 +215,6 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
 def allocate(p: Precision, cells: int, contacts: int, device: Any, law: Any) -> None:
     """The arrays of the struct `Law` that this needs."""
     law.loads, law.answers = (wp.zeros(KEPT * contacts, dtype=p.real, device=device) for _ in range(2))
+    law.wanted = wp.zeros(contacts, dtype=p.real, device=device)
     law.small = wp.zeros(SMALL * cells, dtype=p.real, device=device)
     law.known = wp.zeros(cells, dtype=wp.int32, device=device)
