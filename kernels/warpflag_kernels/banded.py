@@ -39,6 +39,7 @@ def types(p: Precision) -> SimpleNamespace:
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
+        tangent: wp.array(dtype=p.vec3)  # [E], at a node: D acts along and across it
         # Coupling to the body.
         to_body: wp.array(dtype=mat46)  # [K * 3]: H_fb of elements 0, 1, 2
         from_body: wp.array(dtype=mat46)  # [K * 3]: H_bf^T; differs without the bearing torque
@@ -71,6 +72,12 @@ def functions(p: Precision) -> SimpleNamespace:
         return vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
     @wp.func(module=p.module("banded_functions"))
+    def drag(model: Model, band: Band, e: wp.int32, v: vec3):
+        """D^-1 v of node e [pN]."""
+        along = wp.dot(band.tangent[e], v) * band.tangent[e]
+        return along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+
+    @wp.func(module=p.module("banded_functions"))
     def solve_flagellum(model: Model, band: Band, k: wp.int32, x: Increment):
         """Solves with the factors of flagellum k, the body at rest; in place."""
         solve(model.first_node[k], model.first_node[k + 1], band.diagonal, band.lower1, band.lower2, x.node)
@@ -91,7 +98,7 @@ def functions(p: Precision) -> SimpleNamespace:
         return y
 
     return SimpleNamespace(
-        body_mobility=body_mobility, solve_flagellum=solve_flagellum, solve_cell=solve_cell, follow=follow
+        body_mobility=body_mobility, drag=drag, solve_flagellum=solve_flagellum, solve_cell=solve_cell, follow=follow
     )
 
 
@@ -145,6 +152,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         t = state.tangent[e]
         if e < last:
             t = wp.normalize(t + state.tangent[e + 1])
+        band.tangent[e] = t
         across = inv_dt / model.mobility_across[e]
         along = inv_dt / model.mobility_along[e]
         b = e - 1  # the joint before: this segment is its f

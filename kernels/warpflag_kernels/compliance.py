@@ -98,10 +98,11 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
     load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
     band_functions = banded.functions(p)
     body_mobility, solve_flagellum = band_functions.body_mobility, band_functions.solve_flagellum
-    solve_cell, follow = band_functions.solve_cell, band_functions.follow
+    drag, solve_cell, follow = band_functions.drag, band_functions.solve_cell, band_functions.follow
     side_by_side = lanes == 1 and not p.strict
     lever = contacts.functions(p)
-    gap_change, segment_loads, body_load = lever.gap_change, lever.segment_loads, lever.body_load
+    gap_change, body_load = lever.gap_change, lever.body_load
+    segment_loads, node_loads = lever.segment_loads, lever.node_loads
     module = p.module("compliance", f"{pairs}_{form}_{lanes}")
 
     @wp.func(module=module)
@@ -150,21 +151,31 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         begin = model.first_node[k_begin]
         end = model.first_node[k_end]
         e = begin + lane
-        while e < end:
-            on_first, on_second = segment_loads(contacts_in, law.load, e)
-            law.on_first[e] = on_first
-            law.on_second[e] = on_second
-            e += lanes
-        meet()
-        e = begin + lane
-        while e < end:
-            f = law.on_second[e]
-            if e + 1 < end:
-                f += law.on_first[e + 1]  # zero where the next element is a tripod
-            law.on_node[e] = f
-            if wp.static(pairs != "none") and e > model.first_node[model.flagellum_of[e]]:
-                load(flow, flow.place[e], f)
-            e += lanes
+        if wp.static(lanes == 1):
+            while e < end:
+                law.on_node[e] = vec3(real(0.0))
+                e += 1
+            node_loads(model, contacts_in, law.load, c, law.on_node)
+        else:
+            while e < end:
+                on_first, on_second = segment_loads(contacts_in, law.load, e)
+                law.on_first[e] = on_first
+                law.on_second[e] = on_second
+                e += lanes
+            meet()
+            e = begin + lane
+            while e < end:
+                f = law.on_second[e]
+                if e + 1 < end:
+                    f += law.on_first[e + 1]  # zero where the next element is a tripod
+                law.on_node[e] = f
+                e += lanes
+        if wp.static(pairs != "none"):
+            e = begin + lane
+            while e < end:
+                if e > model.first_node[model.flagellum_of[e]]:
+                    load(flow, flow.place[e], law.on_node[e])
+                e += lanes
         meet()
         if wp.static(form != "gathered"):
             spread(model, flow, c, loaded_end(model, flow, c))
@@ -176,12 +187,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
             if e > model.first_node[k]:
                 f = law.on_node[e]
                 if wp.static(pairs != "none"):
-                    t = state.tangent[e]
-                    if e + 1 < model.first_node[k + 1]:
-                        t = wp.normalize(t + state.tangent[e + 1])
-                    v = flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0)
-                    along = wp.dot(t, v) * t
-                    f += along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+                    f += drag(model, band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
                 f = gain * f
             law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
             e += lanes

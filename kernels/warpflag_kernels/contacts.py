@@ -119,6 +119,28 @@ def functions(p: Precision) -> SimpleNamespace:
         return on_first, on_second
 
     @wp.func(module=module)
+    def node_loads(
+        model: Model, contacts_in: Contacts, magnitude: wp.array(dtype=real), c: wp.int32, out: wp.array(dtype=vec3)
+    ):
+        """Adds contact forces to those on all nodes of cell c, r_0 included; for one thread."""
+        i = contacts_in.first[c]
+        stop = i + contacts_in.count[c]
+        while i < stop:
+            e = contacts_in.segment[i]
+            j = contacts_in.other[i]
+            f = magnitude[i] * contacts_in.normal[i]
+            if j < 0:
+                out[e] += f
+            else:
+                on_second = contacts_in.at[i] * f
+                out[e] += on_second
+                out[e - 1] += f - on_second
+                on_second = contacts_in.at_other[i] * f
+                out[j] -= on_second
+                out[j - 1] -= f - on_second
+            i += 1
+
+    @wp.func(module=module)
     def body_load(
         model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
     ):
@@ -130,14 +152,14 @@ def functions(p: Precision) -> SimpleNamespace:
             i = contacts_in.next[i]
         return load
 
-    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, body_load=body_load)
+    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, node_loads=node_loads, body_load=body_load)
 
 
 @functools.cache
-def _kernel(p: Precision, body: bool) -> Any:
+def _kernels(p: Precision, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
-    segment_loads = functions(p).segment_loads
+    segment_loads, node_loads = functions(p).segment_loads, functions(p).node_loads
 
     @wp.kernel(module=p.module("contacts", "body" if body else ""))
     def act(
@@ -164,7 +186,34 @@ def _kernel(p: Precision, body: bool) -> Any:
                 reaction = magnitude[i] * contacts.normal[i]
             state.body_contact[e] = reaction
 
-    return act
+    @wp.kernel(module=p.module("contacts", "cells_body" if body else "cells"))
+    def act_on_cells(
+        # Model:
+        model: Model,
+        # State:
+        contacts: Contacts,
+        magnitude: wp.array(dtype=real),
+        # Out:
+        state: State,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        node_loads(model, contacts, magnitude, c, state.force)
+        if wp.static(body):
+            e = model.first_node[model.first_flagellum[c]]
+            while e < model.first_node[model.first_flagellum[c + 1]]:
+                state.body_contact[e] = vec3(real(0.0))
+                e += 1
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                i = contacts.body_head[k]
+                while i >= 0:
+                    state.body_contact[contacts.segment[i]] = magnitude[i] * contacts.normal[i]
+                    i = contacts.next[i]
+                k += 1
+
+    return SimpleNamespace(act=act, act_on_cells=act_on_cells)
 
 
 def allocate(model: DeviceModel, touching: bool) -> Any:
@@ -191,7 +240,8 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
 
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
     """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
-    inputs = [model.data, contacts, magnitude, state.data]
-    wp.launch(
-        _kernel(model.precision, model.switches.body_contact), model.element_count, inputs=inputs, device=model.device
-    )
+    kernels, inputs = _kernels(model.precision, model.switches.body_contact), [model.data, contacts, magnitude, state.data]
+    if model.one_thread_per_cell:
+        wp.launch(kernels.act_on_cells, model.cell_count, inputs=inputs, device=model.device)
+    else:
+        wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

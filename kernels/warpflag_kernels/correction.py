@@ -25,6 +25,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
     Increment, Band, vec6 = chain.types(p).Increment, banded.types(p).Band, banded.types(p).vec6
     Contacts, Law = contacts.struct(p), compliance.struct(p)
+    drag = banded.functions(p).drag
     segment_loads, body_load = contacts.functions(p).segment_loads, contacts.functions(p).body_load
     Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form, lanes)
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
@@ -191,11 +192,7 @@ def _kernels(p: Precision, bearing_torque: bool, touching: bool, pairs: str, for
             v = vec3(d[0], d[1], d[2]) - inv_dt * vec3(y[0], y[1], y[2])
             if wp.static(pairs != "none"):
                 v += gain * flow_at(model, flow, e, k, c, places_end(model, c), lane)
-            t = state.tangent[e]
-            if e + 1 < model.first_node[k + 1]:
-                t = wp.normalize(t + state.tangent[e + 1])
-            along = wp.dot(t, v) * t
-            v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+            v = drag(model, band, e, v)
             v += gain * state.force[e]
         elif lane == 0 and k == model.first_flagellum[c]:
             u = state.body_velocity[c]

@@ -74,6 +74,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     Band, Contacts = banded.types(p).Band, contacts.struct(p)
     Law = compliance.struct(p)
     _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
+    drag = banded.functions(p).drag
     f = step_control.functions(p)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("implicit")
@@ -192,11 +193,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
-            t = state.tangent[e]
-            if e + 1 < model.first_node[k + 1]:
-                t = wp.normalize(t + state.tangent[e + 1])
-            along = wp.dot(t, v) * t
-            v = along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+            v = drag(model, band, e, v)
         elif k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]

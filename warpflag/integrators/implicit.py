@@ -101,6 +101,7 @@ class ImplicitStepper:
         b = bt.Band()
         b.step, b.weight = zeros(cells, wp.float64), zeros(cells, wp.float64)
         b.diagonal, b.lower1, b.lower2 = (zeros(elements, bt.mat44) for _ in range(3))
+        b.tangent = zeros(elements, p.vec3)
         b.to_body, b.from_body = zeros(3 * flagella, bt.mat46), zeros(3 * flagella, bt.mat46)
         b.body_block, b.body_columns = zeros(flagella, bt.mat66), zeros(6 * elements, p.vec4)
         b.body_inverse, b.singular = zeros(cells, bt.mat66), zeros(cells, wp.int32)
