@@ -1,8 +1,7 @@
 """How strongly the flows outside the matrix act: the over-implicitness that keeps a step stable, measured.
 
 The matrix of an implicit step holds the local mobility alone. With the full one, M, a stiff mode is kappa times as
-fast as the matrix takes it to be: side by side, filaments carry each other along. A step with one defect correction
-leaves (1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest
+fast as the matrix takes it to be: side by side, filaments carry each other along. A step of two iterations leaves (1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest
 eigenvalue of w P (1/dt + g M H), P the solution with the matrix; a power iteration follows it, one product every few
 steps, from a direction that the cell keeps.
 """
@@ -13,14 +12,13 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels import banded, chain, correction
+from warpflag_kernels import banded, chain, linearised
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
-import os
-SHARE = float(os.environ.get("SHARE","0.65"))  # of kappa that the over-implicitness takes
+SHARE = 0.65  # of kappa that the over-implicitness takes
 FALL = 0.97  # of it from one look to the next at least: a power iteration comes from below
-MOST = 5.0  # beyond, one correction leaves too much of what is stiff
+MOST = 5.0  # beyond, two iterations leave too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at
 INTERVAL = 4  # steps between two looks later
 
@@ -158,8 +156,7 @@ def measure(
     stiffness: Any,
     band: Any,
     flow: Any,
-    law: Any,
-    nothing: Any,
+    gain: wp.array,
     answer: Any,
     stability: Any,
     over_implicit: Any,
@@ -167,14 +164,13 @@ def measure(
     """One power iteration of the cells that look, and their over-implicitness from it.
 
     Args:
-        nothing: an increment that is zero.
+        gain: g, shape [cell_count].
         answer: increment to work in; the forces of `state` are overwritten.
         over_implicit: shape [cell_count].
     """
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
-    # The defect of the probe alone is the product with its sign changed, which a power iteration does not mind.
-    correction.defect(model, state, stiffness, band, flow, law, nothing, stability.probe, answer)
+    linearised.apply(model, state, stiffness, band, flow, gain, stability.probe, answer)
     banded.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)

@@ -19,7 +19,6 @@ from warpflag_kernels import (
     contact_search,
     contacts,
     control,
-    correction,
     elastic,
     flow,
     forces,
@@ -127,7 +126,7 @@ class ImplicitStepper:
         # Three flagella or more need their over-implicitness measured.
         self.stability: Any = None
         if model.switches.pairs != "none" and max(len(s.resolved_flagella()) for s in scenes) > 2:
-            self._nothing, self.stability = increment(), self._stability_arrays(increment())
+            self.stability = self._stability_arrays(increment())
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -214,7 +213,7 @@ class ImplicitStepper:
     def _measure_stability(self) -> None:
         model, state = self._system.model, self._system.state
         stability.measure(
-            model, state, self._stiffness, self._band, self._flow, self._law, self._nothing, self._rest,
+            model, state, self._stiffness, self._band, self._flow, self._law.gain, self._rest,
             self.stability, self.data.over_implicit,
         )  # fmt: skip
 
