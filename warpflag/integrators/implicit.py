@@ -26,6 +26,7 @@ from warpflag_kernels import (
     hessian,
     implicit,
     mobility,
+    rough_velocities,
     secant,
     stability,
 )
@@ -148,7 +149,7 @@ class ImplicitStepper:
             contact_law.press(model, state, i.beyond, self._predicted, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)
-        self._right_hand_side()
+        self._right_hand_side(rough_velocities.serves(model))
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
         x = self._solve(self._carried, self._found_on, ROUGH)
@@ -181,7 +182,7 @@ class ImplicitStepper:
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         control.count_pass(s.control, device)
 
-    def _right_hand_side(self) -> None:
+    def _right_hand_side(self, rough: bool = False) -> None:
         """Velocities at the present pose, with the contact forces found so far."""
         model, state = self._system.model, self._system.state
         elastic.joint_gradients(model, state)
@@ -189,7 +190,10 @@ class ImplicitStepper:
         if self._touches:
             contacts.act(model, state, self._contacts, self._law.force)
         body.body_motion(model, state)
-        mobility.node_velocities(model, state)
+        if rough:
+            rough_velocities.node_velocities(model, state, self._flow)
+        else:
+            mobility.node_velocities(model, state)
 
     def _solve(self, last: Any, found: Any, coarse: float = 1.0) -> Any:
         """The increment that is still missing at the present pose.
