@@ -217,8 +217,8 @@ def build_guard(model: DeviceModel, chart: Any) -> Any:
     g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
     if model.switches.steric:
         g.position = wp.clone(chart.base_position)
-        g.longest, g.moved, g.shifted = (
-            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(3)
+        g.longest, g.moved, g.strayed, g.shifted = (
+            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(4)
         )
     return g
 

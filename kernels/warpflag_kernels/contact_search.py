@@ -15,6 +15,7 @@ from warpflag_kernels import chain, contacts, neighbours, steric
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
+REACH = steric.CUTOFF + MARGIN  # of what is listed [sigma]
 
 
 @functools.cache
@@ -28,7 +29,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
     )  # fmt: skip
     all_slots, all_asked = wp.constant(neighbours.SLOTS), wp.constant(wp.uint64(2**64 - 1))
-    reach_factor = real(steric.CUTOFF + MARGIN)
+    reach_factor = real(REACH)
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
@@ -120,6 +121,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         if state.active[model.cell_of[e]] == 0:
             return
         listed.stop[e] = 0
+        listed.position[e] = pose.position[e]
         if e > model.first_node[model.flagellum_of[e]]:
             found, seen = visit(model, pose, near, listed, e, 0, 0, all_asked)
             listed.stop[e] = found
@@ -229,6 +231,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
             listed.start[e] = i
             listed.stop[e] = i
             listed.head[e] = -1
+            listed.position[e] = pose.position[e]
             e += 1
             while e < end:
                 room = listed.first[c + 1] - i
@@ -240,6 +243,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 i += found
                 listed.stop[e] = i
                 listed.head[e] = -1
+                listed.position[e] = pose.position[e]
                 e += 1
             listed.body_head[k] = -1
             k += 1

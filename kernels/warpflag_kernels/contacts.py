@@ -27,6 +27,7 @@ def struct(p: Precision) -> Any:
     class Contacts:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
+        position: wp.array(dtype=vec3)  # [E], of the nodes where contacts were looked for [um]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
         found: wp.array(dtype=wp.uint64)  # [E], which neighbours of a segment are contacts, a bit each
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
@@ -231,6 +232,7 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
     c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
     c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
     c.found = zeros(elements, wp.uint64)
+    c.position = zeros(elements, p.vec3)
     c.body_head = zeros(model.flagellum_count, wp.int32)
     c.segment, c.other, c.next, c.anchored = (zeros(total, wp.int32) for _ in range(4))
     c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))

@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels import chart as chart_stage
-from warpflag_kernels import frames, neighbours, steric
+from warpflag_kernels import contact_search, contacts, frames, neighbours, steric
 from warpflag_kernels.control import STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
@@ -60,13 +60,14 @@ def struct(p: Precision) -> Any:
         position: wp.array(dtype=vec3)  # [E], at the last check [um]
         longest: wp.array(dtype=real)  # [K], its longest segment [um]
         moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
-        shifted: wp.array(dtype=real)  # [K], the same since the lists of neighbours were built [um]
+        strayed: wp.array(dtype=real)  # [K], from where contacts were looked for, by a stepper that does [um]
+        shifted: wp.array(dtype=real)  # [K], its longest way from where the lists of neighbours were built [um]
 
     return Guard
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
@@ -76,13 +77,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
     beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
+    Contacts, listed_reach = contacts.struct(p), wp.constant(real(contact_search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
-    module = p.module("guard")
+    module = p.module("guard", "listing" if listing else "")
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
@@ -137,12 +139,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
     def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
         """Whether two segments pass through each other while their ends move linearly to the new places."""
         zero, one = real(0.0), real(1.0)
-        # No point of one has moved further against a point of the other than their ends have.
-        dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
-        moved = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
-        moved = wp.sqrt(wp.max(moved, wp.max(wp.length_sq(dp1 - dq2), wp.length_sq(dq1 - dp2))))
-        if distance(p1n, q1n - p1n, p2n, q2n - p2n) > moved + touch:
-            return False
         # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign
         # before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
         a, b, r = q1 - p1, q2 - p2, p2 - p1
@@ -189,16 +185,23 @@ def _kernels(p: Precision) -> SimpleNamespace:
         """Whether segments e and j have passed through each other since the last look; no node has moved further."""
         away = middle(state, e) - middle(state, j)
         half = real(0.5) * state.length[j]
-        reach = touch + real(2.0) * moved
-        within = real(0.5) * state.length[e] + half + reach
+        within = real(0.5) * state.length[e] + half + touch
+        reach = within + real(2.0) * moved
+        if not (wp.dot(away, away) < reach * reach):
+            return False
+        # No point of one has moved further against a point of the other than their ends have.
+        p1n, q1n, p2n, q2n = state.position[e - 1], state.position[e], state.position[j - 1], state.position[j]
+        p1, q1, p2, q2 = guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j]
+        dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
+        parted = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
+        parted = wp.sqrt(wp.max(parted, wp.max(wp.length_sq(dp1 - dq2), wp.length_sq(dq1 - dp2))))
+        reach = within + parted
         return (
-            wp.dot(away, away) < within * within
-            and not beside(away, state.tangent[e], state.tangent[j], half, reach)
-            and crossed(
-                guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j],
-                state.position[e - 1], state.position[e], state.position[j - 1], state.position[j], touch,
-            )
-        )  # fmt: skip
+            wp.dot(away, away) < reach * reach
+            and not beside(away, state.tangent[e], state.tangent[j], half, touch + parted)
+            and distance(p1n, q1n - p1n, p2n, q2n - p2n) < touch + parted
+            and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch)
+        )
 
     @wp.kernel(module=module)
     def check_crossings(
@@ -209,6 +212,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         chart: Chart,
         guard: Guard,
         near: Neighbours,
+        listed: Contacts,
         # Out:
         control: Control,
     ):
@@ -227,8 +231,22 @@ def _kernels(p: Precision) -> SimpleNamespace:
             moved = wp.max(moved, guard.moved[other])
             shifted = wp.max(shifted, guard.shifted[other])
             other += 1
-        # What can have met between the two looks stands in the lists, if nothing has moved far.
-        if real(2.0) * (moved + shifted) + touch < contact_reach * model.steric_diameter[c] + skin:
+        if wp.static(listing):
+            # The same holds for contacts, of which there are fewer.
+            strayed = real(0.0)
+            other = model.first_flagellum[c]
+            while other < model.first_flagellum[c + 1]:
+                strayed = wp.max(strayed, guard.strayed[other])
+                other += 1
+            if real(2.0) * strayed + touch < listed_reach * model.steric_diameter[c]:
+                i = listed.start[e]
+                while i < listed.stop[e]:
+                    if listed.other[i] >= 0 and met(state, guard, e, listed.other[i], moved, touch):
+                        wp.atomic_min(control.fault, c, crossing + e)
+                    i += 1
+                return
+        # What can have met between the two looks stands in the lists, if nothing has been far from where they were made.
+        if real(2.0) * shifted + touch < contact_reach * model.steric_diameter[c] + skin:
             i = first_later(model, near, e)
             while i < candidates(model, near, e):
                 j = candidate(model, near, e, i)
@@ -255,6 +273,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # State:
         state: State,
         near: Neighbours,
+        listed: Contacts,
         # Out:
         guard: Guard,
     ):
@@ -265,15 +284,22 @@ def _kernels(p: Precision) -> SimpleNamespace:
         moved = real(0.0)
         shifted = real(0.0)
         longest = real(0.0)
+        strayed = real(0.0)
         while e < model.first_node[k + 1]:
             if e > model.first_node[k]:
                 longest = wp.max(longest, state.length[e])
             moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
             shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
+            shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
+            if wp.static(listing):
+                strayed = wp.max(strayed, wp.length(state.position[e] - listed.position[e]))
+                strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
             e += 1
         guard.longest[k] = longest
         guard.moved[k] = moved
         guard.shifted[k] = shifted
+        if wp.static(listing):
+            guard.strayed[k] = strayed
 
     @wp.kernel(module=module)
     def remember(
@@ -296,16 +322,24 @@ def _kernels(p: Precision) -> SimpleNamespace:
     )
 
 
-def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
+def check(
+    model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None
+) -> None:
     """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
-    `fault`."""
-    kernels = _kernels(model.precision)
+    `fault`.
+
+    Args:
+        listed: contacts that have been looked for between the last look and this one, if any.
+    """
+    p, listing = model.precision, listed is not None
+    kernels = _kernels(p, listing)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
     if model.switches.steric:
-        moves = [model.data, state.data, state.neighbours, guard]
+        found = listed if listing else contacts.struct(p)()
+        moves = [model.data, state.data, state.neighbours, found, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
-        inputs = [model.data, state.data, chart, guard, state.neighbours, control]
+        inputs = [model.data, state.data, chart, guard, state.neighbours, found, control]
         wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
 
 
@@ -313,4 +347,5 @@ def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, con
     """Keeps the checked pose: the next check looks for crossings since then."""
     if model.switches.steric:
         inputs = [model.data, state.data, control, chart, guard]
-        wp.launch(_kernels(model.precision).remember, model.element_count, inputs=inputs, device=model.device)
+        kernel = _kernels(model.precision, False).remember
+        wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

@@ -167,7 +167,7 @@ class ImplicitStepper:
         wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
         carry = (self._total, self._carried_on, self._next_last, self._next_before)
         chain.retract(model, state, self._now, i.one, self._rest, self._now, carry)
-        guard.check(model, state, s.chart, s.guard, s.control)
+        guard.check(model, state, s.chart, s.guard, s.control, self._contacts if self._touches else None)
         inputs = [model.data, state.data, band, *law, s.chart, s.control, self.steps, i]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
         moved = [self._next_last, self._next_before]
