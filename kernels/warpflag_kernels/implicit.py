@@ -34,10 +34,10 @@ from warpflag_kernels.types import Precision, structs
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
 import os
-PEAK = float(os.environ.get('PEAK', '2.0')) / 12
+PEAK = float(os.environ.get('PEAK', '1.67'))
 THETA = float(os.environ.get("THETA", "0.75"))  # where in a step the equations hold; 1 is BDF2
 LEAD = float(os.environ.get("LEAD", "0.5"))  # share of a prediction that a pose takes at most: with more, weak stiff modes grow
-GAP_SHARE = float(os.environ.get("GAP_SHARE","0.5"))  # of the error that a step may make, for what the contact law leaves over
+GAP_SHARE = float(os.environ.get("GAP_SHARE","0.25"))  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
 
@@ -75,10 +75,9 @@ def kernels(p: Precision) -> SimpleNamespace:
     Law = compliance.struct(p)
     _Pose, Increment, vec6 = chain.types(p).Pose, chain.types(p).Increment, chain.types(p).vec6
     drag = banded.functions(p).drag
-    f = step_control.functions(p)
-    accept, next_step, smallest = f.accept, f.next_step, f.smallest
+    f = step_control.functions(p, independent=True)
+    allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     module = p.module("implicit")
-    gamma = wp.constant(wp.float64(float(os.environ.get("GAMMA", "0.5"))))
     theta, most_lead = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(LEAD))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
@@ -122,7 +121,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         law.gain[c] = g
         law.failed[c] = 0
         finest_gap = wp.float64(model.steric_diameter[c]) * finest
-        enough = wp.max(gap_share * steps.tolerance[c] * dt, gap_growth * dt * dt * dt)
+        enough = wp.max(gap_share * allowed(steps, c, dt), gap_growth * dt * dt * dt)
         law.tolerance[c] = real(wp.max(finest_gap, enough))
         contacts_out.overflow[c] = 0
         imp.evaluations[c] += 1
@@ -305,7 +304,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             foreseen += wp.float64(imp.predicted[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
-        error = peak * missed / wp.float64(nodes) * wp.pow(dt / wp.float64(1.0e-5), gamma)
+        error = peak * missed / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):

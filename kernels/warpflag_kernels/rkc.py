@@ -70,7 +70,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
-    f = step_control.functions(p)
+    f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))

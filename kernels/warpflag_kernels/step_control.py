@@ -13,11 +13,11 @@ import warp as wp
 
 from warpflag_kernels.types import Precision
 
+SPAN = 1.0e-3  # over which independent errors add up to what may be made in it [s]
 LARGEST_GROWTH = 2.0  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
-REFUSED = float(__import__("os").environ.get("REF","25.0"))  # a step whose estimate is this many times the tolerance is taken again
+REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
-import os
-MEMORY = float(os.environ.get("MEM", "5.0e-4"))  # of that mean [s]
+MEMORY = 5.0e-4  # of that mean [s]
 FORGOTTEN = 0.02  # of that time: a mean of estimates that fade without new ones counts no longer
 JUMP = 0.25  # of the error that is left after halving a refused step, when the velocity itself jumps (smooth: 1/8)
 SHORTEST_STEP = 2.0e-8  # that an error estimate asks for [s]; only a step that can't be solved goes below
@@ -38,14 +38,22 @@ class StepControl:
 
 
 @functools.cache
-def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of one precision."""
-    module = p.module("step_control")
+def functions(p: Precision, independent: bool) -> SimpleNamespace:
+    """Device functions of one precision, for errors that are independent from step to step, or alike."""
+    module = p.module("step_control", "independent" if independent else "alike")
+    power = 0.5 if independent else 1.0  # of dt in the error that a step may make
+    scale = wp.constant(wp.float64(SPAN ** (1.0 - power)))
+    power, root = wp.constant(wp.float64(power)), wp.constant(wp.float64(1.0 / (3.0 - power)))
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
     forgotten = wp.constant(wp.float64(FORGOTTEN * MEMORY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
     jump, shortest = (wp.constant(wp.float64(x)) for x in (JUMP, SHORTEST_STEP))
+
+    @wp.func(module=module)
+    def allowed(control: StepControl, c: wp.int32, dt: wp.float64):
+        """Error that a step may make [um]."""
+        return control.tolerance[c] * scale * wp.pow(dt, power)
 
     @wp.func(module=module)
     def accept(
@@ -67,12 +75,12 @@ def functions(p: Precision) -> SimpleNamespace:
         one = wp.float64(1.0)
         factor = growth
         good = sound
-        tolerance = control.tolerance[c]
-        if tolerance > wp.float64(0.0) and known:
+        most = allowed(control, c, dt)
+        if most > wp.float64(0.0) and known:
             # A shorter step is no better where the velocity jumps, as at contacts of parallel segments: go on.
             before = control.refused_error[c]
             jumps = before > wp.float64(0.0) and error > jump * before
-            good = sound and (error < refused * tolerance * dt or jumps or dt <= shortest)
+            good = sound and (error < refused * most or jumps or dt <= shortest)
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
                 level = wp.log(bound / (dt * dt * dt))
@@ -80,7 +88,7 @@ def functions(p: Precision) -> SimpleNamespace:
                 seen = error >= bound
                 # What is lost in round-off lowers the mean at most; longer steps will tell. But where round-off hides
                 # all that is allowed, the mean of what was seen holds, until nothing has confirmed it for long.
-                hidden = lost > tolerance * dt
+                hidden = lost > most
                 if seen or (not hidden and level * control.error_time[c] < control.error_sum[c]):
                     control.error_sum[c] = fade * control.error_sum[c] + level * dt
                     control.error_time[c] = fade * control.error_time[c] + dt
@@ -92,7 +100,8 @@ def functions(p: Precision) -> SimpleNamespace:
                         control.error_time[c] = wp.float64(0.0)
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
-                    factor = wp.min(growth, wp.max(wp.sqrt(safety * tolerance / level), shortest) / dt)
+                    best = wp.pow(safety * scale * control.tolerance[c] / level, root)
+                    factor = wp.min(growth, wp.max(best, shortest) / dt)
                 if factor > wp.float64(0.8) and factor < wp.float64(1.25):
                     factor = one
         if good:
@@ -119,4 +128,4 @@ def functions(p: Precision) -> SimpleNamespace:
             dt = wp.float64(0.5) * left
         return dt
 
-    return SimpleNamespace(accept=accept, next_step=next_step, smallest=smallest)
+    return SimpleNamespace(allowed=allowed, accept=accept, next_step=next_step, smallest=smallest)
