@@ -52,6 +52,39 @@ _LOAD = """
     }
     return total;
 """
+# What a product has found, added to what was found before.
+_TAKE = """
+    REAL* __restrict__ A = law_in.applied.data; const REAL* __restrict__ L = law_in.load.data;
+    REAL* __restrict__ N = law_in.answered.data; const REAL* __restrict__ C = law_in.change.data;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int i = begin + lane; i < stop; i += LANES) { A[i] += L[i]; N[i] += C[i]; }
+    REAL* __restrict__ X = reinterpret_cast<REAL*>(x.node.data);
+    const REAL* __restrict__ Y = reinterpret_cast<const REAL*>(law_in.answer.node.data);
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int i = 4 * first + lane; i < 4 * end; i += LANES) X[i] += Y[i];
+"""
+# Residuals, and the largest. Compared as integers, what is not a number is larger than all others.
+_LEAVE = """
+    const REAL* __restrict__ G = law_in.solved_gap.data; const REAL* __restrict__ F = law_in.free_gap.data;
+    const REAL* __restrict__ N = law_in.answered.data; REAL* __restrict__ R = law_in.residual.data;
+    BITS worst = 0;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int i = begin + lane; i < stop; i += LANES) {
+        union { REAL value; BITS bits; } r;
+        R[i] = G[i] - F[i] - N[i];
+        r.value = wp::abs(R[i]);
+        worst = r.bits > worst ? r.bits : worst;
+    }
+    union { BITS bits; REAL value; } r;
+    r.bits = worst;
+    return r.value < (REAL)3.0e38 ? r.value : (REAL)3.0e38;
+"""
 # New gaps, each of which settles against its own compliance alone. What is left of its equation is concave: Newton's
 # method overshoots from above once, from below it rises to the solution.
 _SETTLE = """
@@ -94,12 +127,21 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
     module = p.module("contact_law", f"{pairs}_{form}_{lanes}")
 
     def native(text: str) -> str:
+        text = text.replace("BITS", {"float64": "long long", "float32": "int"}[p.name])
         return steric.code(p, text).replace("LANES", str(lanes)).replace("SETTLING", str(SETTLING))
 
     @wp.func_native(native(_LOAD))
     def load_all(
         law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, lane: wp.int32
     ) -> real: ...
+
+    @wp.func_native(native(_TAKE))
+    def take(
+        law_in: Law, x: Increment, begin: wp.int32, stop: wp.int32, first: wp.int32, end: wp.int32, lane: wp.int32
+    ): ...
+
+    @wp.func_native(native(_LEAVE))
+    def leave(law_in: Law, begin: wp.int32, stop: wp.int32, lane: wp.int32) -> real: ...
 
     @wp.func_native(native(_SETTLE))
     def settle_all(law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, lane: wp.int32): ...
@@ -159,26 +201,12 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         loaded = block_sum(law, loaded, c, lane)
         if not (loaded == real(0.0)):
             product(model, state, contacts_in, band, flow, law, c, lane)
-            e = model.first_node[model.first_flagellum[c]] + lane
-            while e < model.first_node[model.first_flagellum[c + 1]]:
-                x.node[e] = x.node[e] + law.answer.node[e]
-                e += lanes
+            first = model.first_node[model.first_flagellum[c]]
+            end = model.first_node[model.first_flagellum[c + 1]]
+            take(law, x, begin, stop, first, end, lane)
             if lane == 0:
                 x.body[c] = x.body[c] + law.answer.body[c]
-            i = begin + lane
-            while i < stop:
-                law.applied[i] = law.applied[i] + law.load[i]
-                law.answered[i] = law.answered[i] + law.change[i]
-                i += lanes
-        worst = real(0.0)
-        i = begin + lane
-        while i < stop:
-            r = law.solved_gap[i] - law.free_gap[i] - law.answered[i]
-            law.residual[i] = r
-            if not wp.isfinite(r):
-                r = infinite  # a maximum would pass over what is not a number
-            worst = wp.max(worst, wp.abs(r))
-            i += lanes
+        worst = leave(law, begin, stop, lane)
         return block_max(law, worst, c, lane), loaded
 
     @wp.kernel(module=module)
