@@ -163,7 +163,9 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
             return
         i = contacts_out.first[c] + lane
         while i < contacts_out.first[c] + contacts_out.count[c]:
-            gap = contacts_out.gap[i] + real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
+            gap = contacts_out.gap[i]
+            if share[c] > wp.float64(0.0):
+                gap += real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
             counted = wp.max(gap, deepest * model.steric_diameter[c])
             law.force[i] = steric_force(counted, model.steric_strength[c], model.steric_diameter[c])
             law.solved_gap[i] = gap

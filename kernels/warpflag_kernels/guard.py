@@ -20,7 +20,7 @@ from warpflag_kernels.control import STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LARGEST_STRAIN = 0.05
-LARGEST_TWIST = 0.5 * 3.141592653589793  # per joint [rad]
+LARGEST_TWIST = 0.5 * 3.141592653589793  # per joint [rad]: where its cosine vanishes
 SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
 LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
 ELEMENT_BITS = 26
@@ -71,7 +71,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
-    twist_angle = frames.functions(p).twist_angle
+    twist = frames.functions(p).twist
     closest_parameters = steric.functions(p).closest_parameters
     near_by = neighbours.functions(p)
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
@@ -79,7 +79,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
     Contacts, listed_reach = contacts.struct(p), wp.constant(real(contact_search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
-    largest_strain, largest_twist, smallest_fold = real(LARGEST_STRAIN), real(LARGEST_TWIST), real(SMALLEST_FOLD)
+    largest_strain, least_cosine, smallest_fold = real(LARGEST_STRAIN), real(0.0), real(SMALLEST_FOLD)
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
@@ -126,7 +126,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             u = state.tangent[e + 1]
             if real(1.0) + wp.dot(t, u) < smallest_fold:
                 wp.atomic_min(control.fault, c, folded + e)
-            if wp.abs(twist_angle(t, u, state.director[e], state.director[e + 1])) > largest_twist:
+            _sine, cosine = twist(t, u, state.director[e], state.director[e + 1])
+            if cosine < least_cosine:
                 wp.atomic_min(control.fault, c, twisted + e)
 
     @wp.func(module=module)
@@ -203,6 +204,16 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch)
         )
 
+    @wp.func(module=module)
+    def farthest(model: Model, ways: wp.array(dtype=real), c: wp.int32):
+        """The longest of these ways of the flagella of cell c."""
+        longest = real(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            longest = wp.max(longest, ways[k])
+            k += 1
+        return longest
+
     @wp.kernel(module=module)
     def check_crossings(
         # Model:
@@ -224,29 +235,21 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
         touch = real(0.05) * model.steric_diameter[c]
-        moved = real(0.0)
-        shifted = real(0.0)
-        other = model.first_flagellum[c]
-        while other < model.first_flagellum[c + 1]:
-            moved = wp.max(moved, guard.moved[other])
-            shifted = wp.max(shifted, guard.shifted[other])
-            other += 1
         if wp.static(listing):
             # The same holds for contacts, of which there are fewer.
-            strayed = real(0.0)
-            other = model.first_flagellum[c]
-            while other < model.first_flagellum[c + 1]:
-                strayed = wp.max(strayed, guard.strayed[other])
-                other += 1
-            if real(2.0) * strayed + touch < listed_reach * model.steric_diameter[c]:
+            if real(2.0) * farthest(model, guard.strayed, c) + touch < listed_reach * model.steric_diameter[c]:
                 i = listed.start[e]
+                moved = real(0.0)
+                if i < listed.stop[e]:
+                    moved = farthest(model, guard.moved, c)
                 while i < listed.stop[e]:
                     if listed.other[i] >= 0 and met(state, guard, e, listed.other[i], moved, touch):
                         wp.atomic_min(control.fault, c, crossing + e)
                     i += 1
                 return
         # What can have met between the two looks stands in the lists, if nothing has been far from where they were made.
-        if real(2.0) * shifted + touch < contact_reach * model.steric_diameter[c] + skin:
+        moved = farthest(model, guard.moved, c)
+        if real(2.0) * farthest(model, guard.shifted, c) + touch < contact_reach * model.steric_diameter[c] + skin:
             i = first_later(model, near, e)
             while i < candidates(model, near, e):
                 j = candidate(model, near, e, i)

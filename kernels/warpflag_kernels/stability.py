@@ -20,7 +20,7 @@ SHARE = 0.65  # of kappa that the over-implicitness takes
 FALL = 0.97  # of it from one look to the next at least: a power iteration comes from below
 MOST = 5.0  # beyond, two iterations leave too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at
-INTERVAL = 4  # steps between two looks later
+INTERVAL = 8  # steps between two looks later
 
 
 @functools.cache
