@@ -39,7 +39,10 @@ def types(p: Precision) -> SimpleNamespace:
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
-        tangent: wp.array(dtype=p.vec3)  # [E], at a node: D acts along and across it
+        # D^-1 of a node [E]: the tangent there, drag across it and what more there is along it [pN s/um].
+        tangent: wp.array(dtype=p.vec3)
+        drag_across: wp.array(dtype=real)
+        drag_excess: wp.array(dtype=real)
         # Coupling to the body.
         to_body: wp.array(dtype=mat46)  # [K * 3]: H_fb of elements 0, 1, 2
         from_body: wp.array(dtype=mat46)  # [K * 3]: H_bf^T; differs without the bearing torque
@@ -72,10 +75,10 @@ def functions(p: Precision) -> SimpleNamespace:
         return vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
     @wp.func(module=p.module("banded_functions"))
-    def drag(model: Model, band: Band, e: wp.int32, v: vec3):
+    def drag(band: Band, e: wp.int32, v: vec3):
         """D^-1 v of node e [pN]."""
-        along = wp.dot(band.tangent[e], v) * band.tangent[e]
-        return along / model.mobility_along[e] + (v - along) / model.mobility_across[e]
+        t = band.tangent[e]
+        return band.drag_across[e] * v + (band.drag_excess[e] * wp.dot(t, v)) * t
 
     @wp.func(module=p.module("banded_functions"))
     def solve_flagellum(model: Model, band: Band, k: wp.int32, x: Increment):
@@ -153,10 +156,12 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
         if e < last:
             t = wp.normalize(t + state.tangent[e + 1])
         band.tangent[e] = t
-        across = inv_dt / model.mobility_across[e]
-        along = inv_dt / model.mobility_along[e]
+        across = real(1.0) / model.mobility_across[e]
+        excess = real(1.0) / model.mobility_along[e] - across
+        band.drag_across[e] = across
+        band.drag_excess[e] = excess
         b = e - 1  # the joint before: this segment is its f
-        drag = across * identity + (along - across) * wp.outer(t, t)
+        drag = (inv_dt * across) * identity + (inv_dt * excess) * wp.outer(t, t)
         xx = stiffness.ff[b] + stiffness.stretch[e]
         x_spin = stiffness.f_second[b]
         spin = stiffness.spins[b][2]

@@ -173,7 +173,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         if wp.static(pairs != "none"):
             e = begin + lane
             while e < end:
-                if e > model.first_node[model.flagellum_of[e]]:
+                if flow.place[e] >= 0:
                     load(flow, flow.place[e], law.on_node[e])
                 e += lanes
         meet()
@@ -187,7 +187,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
             if e > model.first_node[k]:
                 f = law.on_node[e]
                 if wp.static(pairs != "none"):
-                    f += drag(model, band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
+                    f += drag(band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
                 f = gain * f
             law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
             e += lanes

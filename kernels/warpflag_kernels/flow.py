@@ -74,7 +74,7 @@ def struct(p: Precision) -> Any:
         start: wp.array(dtype=wp.int32)  # [K], places of these nodes lie in [start, start + loaded)
         rest: wp.array(dtype=wp.int32)  # [K], where those of the flagellum's other nodes begin
         node: wp.array(dtype=wp.int32)  # [E], of a place; a cell's places begin where its elements do
-        place: wp.array(dtype=wp.int32)  # [E], of a node
+        place: wp.array(dtype=wp.int32)  # [E], of a node; -1: of r_0, which is not in the sum
         sum: PairSum  # by place
         # Coefficients c, q of the pairs, only where they are kept.
         first_pair: wp.array(dtype=wp.int32)  # [C], of a cell's pairs
@@ -324,7 +324,8 @@ def allocate(model: DeviceModel) -> Any:
         return wp.zeros(count, dtype=dtype, device=device)
 
     flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
-    flow.node, flow.place = (zeros(model.element_count, wp.int32) for _ in range(2))
+    flow.node = zeros(model.element_count, wp.int32)
+    flow.place = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
     form = form_of(model)
     results = () if form == "gathered" else ("ux", "uy", "uz")
     for name in ("x", "y", "z", "fx", "fy", "fz", *results):

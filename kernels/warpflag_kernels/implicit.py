@@ -54,6 +54,8 @@ def struct(p: Precision) -> Any:
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
         reach: wp.array(dtype=wp.float64)  # rho
+        curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
+        ratio_before: wp.array(dtype=wp.float64)  # w of the last step
         lead: wp.array(dtype=wp.float64)  # share of a prediction that the first pose takes
         beyond: wp.array(dtype=wp.float64)  # trust beyond that
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
@@ -113,6 +115,11 @@ def kernels(p: Precision) -> SimpleNamespace:
         control.step[c] = dt
         imp.ratio[c] = w
         imp.reach[c] = rho
+        imp.curved[c] = wp.float64(0.0)
+        imp.ratio_before[c] = wp.float64(0.0)
+        if imp.history[c] == 2:
+            imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
+            imp.curved[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
         imp.lead[c] = wp.min(imp.trust[c], most_lead)
         imp.beyond[c] = imp.trust[c] - imp.lead[c]
         band.step[c] = dt
@@ -146,13 +153,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
-        scale = real(0.0)
-        ratio = real(0.0)
-        if imp.history[c] == 2:
-            w = imp.ratio[c]
-            ratio = real(imp.last_step[c] / imp.step_before[c])
-            curved = w * (w + wp.float64(1.0)) / (wp.float64(1.0) + imp.step_before[c] / imp.last_step[c])
-            scale = real(imp.reach[c] * curved)
+        scale = real(imp.curved[c])
+        ratio = real(imp.ratio_before[c])
         lead = real(imp.lead[c])
         ahead = real(theta * imp.ratio[c])
         x = scale * (last.node[e] - ratio * before.node[e])
@@ -192,7 +194,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
-            v = drag(model, band, e, v)
+            v = drag(band, e, v)
         elif k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]

@@ -125,7 +125,7 @@ def _kernels(p: Precision, bearing_torque: bool, pairs: str, form: str, lanes: i
         flow: Flow,
     ):
         e = wp.tid()
-        if e > model.first_node[model.flagellum_of[e]] and state.active[model.cell_of[e]] != 0:
+        if flow.place[e] >= 0 and state.active[model.cell_of[e]] != 0:
             load(flow, flow.place[e], state.force[e])
 
     @wp.kernel(module=module)
@@ -167,7 +167,7 @@ def _kernels(p: Precision, bearing_torque: bool, pairs: str, form: str, lanes: i
             v = vec3(y[0], y[1], y[2])
             if wp.static(pairs != "none"):
                 v -= g * flow_at(model, flow, e, k, c, places_end(model, c), lane)
-            v = drag(model, band, e, v) - g * state.force[e]
+            v = drag(band, e, v) - g * state.force[e]
         elif lane == 0 and k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]

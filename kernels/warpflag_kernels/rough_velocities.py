@@ -35,7 +35,7 @@ def _kernel(p: Precision, pairs: str) -> Any:
         end = model.first_node[model.first_flagellum[c + 1]]
         e = begin
         while e < end:
-            if e > model.first_node[model.flagellum_of[e]]:
+            if flow.place[e] >= 0:
                 load(flow, flow.place[e], state.force[e])
             e += 1
         stop = places_end(model, c)
