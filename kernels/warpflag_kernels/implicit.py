@@ -34,10 +34,10 @@ from warpflag_kernels.types import Precision, structs
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
 import os
-PEAK = float(os.environ.get('PEAK', '1.67'))
-THETA = float(os.environ.get("THETA", "0.75"))  # where in a step the equations hold; 1 is BDF2
+PEAK = float(os.environ.get('PEAK', '1.3'))
+THETA = float(os.environ.get("THETA", "0.72"))  # where in a step the equations hold; 1 is BDF2
 LEAD = float(os.environ.get("LEAD", "0.5"))  # share of a prediction that a pose takes at most: with more, weak stiff modes grow
-GAP_SHARE = float(os.environ.get("GAP_SHARE","0.25"))  # of the error that a step may make, for what the contact law leaves over
+GAP_SHARE = float(os.environ.get("GAP_SHARE","0.35"))  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
 

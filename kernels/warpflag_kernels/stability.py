@@ -16,7 +16,7 @@ from warpflag_kernels import banded, chain, linearised
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
-SHARE = 0.65  # of kappa that the over-implicitness takes
+SHARE = 0.57  # of kappa that the over-implicitness takes
 FALL = 0.97  # of it from one look to the next at least: a power iteration comes from below
 MOST = 5.0  # beyond, two iterations leave too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at

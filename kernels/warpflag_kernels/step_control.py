@@ -1,9 +1,11 @@
 """Step control on the device: from an error estimate per step to the next step, per cell, one rule for every stepper.
 
 The estimate of a second-order step goes as dt^3. A contact that opens or closes makes single estimates jump, though
-what adds up over time is the level between the jumps: hence the control follows the fading mean of log(error/dt^3)
-and keeps the step while that mean asks for less than a fifth of change. A step that follows every fluctuation is less
-accurate at the same cost.
+what adds up over time is the level between the jumps: hence the control follows the fading mean of log(error/dt^3).
+A step that follows every fluctuation is less accurate at the same cost.
+
+How errors add up is the stepper's to say. Alike from step to step, they add up as their number, and one step may make
+tolerance dt. As good as independent, they add up as the root of it, and one may make tolerance (dt SPAN)^1/2.
 """
 
 import functools
@@ -102,8 +104,6 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
                     best = wp.pow(safety * scale * control.tolerance[c] / level, root)
                     factor = wp.min(growth, wp.max(best, shortest) / dt)
-                if factor > wp.float64(0.8) and factor < wp.float64(1.25):
-                    factor = one
         if good:
             control.refused_error[c] = wp.float64(0.0)
             # A step cut short to end on a target says nothing against the longer one wanted before.

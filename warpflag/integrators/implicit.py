@@ -46,7 +46,7 @@ __all__ = ["ImplicitStepper"]
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
 import os
-ROUGH = float(os.environ.get("ROUGH", "3"))
+ROUGH = float(os.environ.get("ROUGH", "2"))
 """How many times their tolerance is enough for gaps that only lead to the defect correction."""
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
