@@ -50,7 +50,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--counts", nargs="+", type=int, default=[2, 3, 4, 8])
     parser.add_argument("--milliseconds", type=int, default=10)
-    parser.add_argument("--finer", type=float, default=2e-3, help="accuracy of the runs to compare with [um per ms]")
+    parser.add_argument("--finer", type=float, default=1e-3, help="accuracy of the runs to compare with [um per ms]")
     args = parser.parse_args()
     print("| flagella | steps | ms of computing per ms | per node | node error um |\n|---|---|---|---|---|")
     first = 0.0

@@ -256,14 +256,20 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         iteration = int(0)
         if anew:
             # What overlaps deeply begins where it would settle alone: huge forces would leave their round-off behind.
-            load_all(law, begin, stop, strength, diameter, lane)
+            any_deep = real(0.0)
             i = begin + lane
             while i < stop:
-                law.wanted[i] = -law.yielding[i] * law.load[i]
-                if law.solved_gap[i] < deep * diameter:
-                    law.wanted[i] = law.free_gap[i] - law.solved_gap[i]
+                any_deep = wp.max(any_deep, deep * diameter - law.solved_gap[i])
                 i += lanes
-            settle_all(law, begin, stop, strength, diameter, lane)
+            if block_max(law, any_deep, c, lane) > real(0.0):
+                load_all(law, begin, stop, strength, diameter, lane)
+                i = begin + lane
+                while i < stop:
+                    law.wanted[i] = -law.yielding[i] * law.load[i]
+                    if law.solved_gap[i] < deep * diameter:
+                        law.wanted[i] = law.free_gap[i] - law.solved_gap[i]
+                    i += lanes
+                settle_all(law, begin, stop, strength, diameter, lane)
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
             worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, lane, x)

@@ -34,7 +34,7 @@ from warpflag_kernels.types import Precision, structs
 # Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
 # vertex make single nodes jump, which does not add up.
 import os
-PEAK = float(os.environ.get('PEAK', '1.3'))
+PEAK = float(os.environ.get('PEAK', '1.5'))
 THETA = float(os.environ.get("THETA", "0.72"))  # where in a step the equations hold; 1 is BDF2
 LEAD = float(os.environ.get("LEAD", "0.5"))  # share of a prediction that a pose takes at most: with more, weak stiff modes grow
 GAP_SHARE = float(os.environ.get("GAP_SHARE","0.35"))  # of the error that a step may make, for what the contact law leaves over
