@@ -76,7 +76,18 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
         return wp.zeros(count, dtype=dtype, device=model.device)
 
     law = struct(p)()
-    for name in ("free_gap", "solved_gap", "residual", "force", "load", "applied", "answered", "change", "yielding", "share"):
+    for name in (
+        "free_gap",
+        "solved_gap",
+        "residual",
+        "force",
+        "load",
+        "applied",
+        "answered",
+        "change",
+        "yielding",
+        "share",
+    ):
         setattr(law, name, zeros(total, p.real))
     law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
     law.on_body = zeros(model.flagellum_count, vec6)

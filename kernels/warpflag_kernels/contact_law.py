@@ -5,11 +5,12 @@ With W the compliance (see `compliance`), the gaps obey
     gap = free + W (F(gap) - acting),
 
 F the steric force, free the gaps that the forces already acting lead to. `press` sets those to begin with: the law at
-the gaps of the predicted pose, so that only changes have to go through W. Newton's method solves it, and GMRES its
-linear systems (1 + k^1/2 W k^1/2) u = -k^1/2 residual with the stiffness k = -dF/dgap: nothing but products with W is
-needed. Contacts are soft against what they rest on over one step, so a few are enough, however many contacts there
-are. An estimate w of a contact's own compliance scales the systems, and takes the steepness of F out of them: Newton's
-steps are straight in gap - w F(gap), not in the gap.
+the predicted gaps, so that only changes have to go through W. Products with W are dear and all else is cheap, so every
+product is made the most of. A quasi-Newton method learns from it what W does to a load (see `secant`) and, for the
+rest, takes each contact to yield by an estimate w of its own compliance; that takes the steepness of F out of the
+systems, since a contact that yields alone can be solved for as it is: gap - w F(gap). What has been learnt in the
+first iteration of a step serves the second. Contacts are soft against what they rest on over one step, so a few
+products are enough, however many contacts there are.
 """
 
 import functools
@@ -29,7 +30,6 @@ SETTLING = 4  # iterations of a contact's own equation
 STIFFENING = 0.25  # of a contact's compliance from local drag, for what else holds it
 DEEP = 0.75  # a solution begins where such a contact would settle alone [sigma]
 DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]
-
 
 
 # What forces at the solved gaps differ by from those that W has been applied to, and how stiff they are; returns
@@ -294,11 +294,11 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
 
 
 def press(model: DeviceModel, state: DeviceState, share: Any, predicted: Any, contacts_out: Any, law: Any) -> None:
-    """Forces at the listed gaps, into `force` and `pressed`: where the solution begins.
+    """Forces at the predicted gaps of the listed contacts, into `force`: where the solution begins.
 
     Args:
-        share, predicted: share * predicted leads to the pose in which the contacts were found; gaps are taken back to
-            the one it begins at. share: per cell, shape [cell_count].
+        share, predicted: share * predicted is what the gaps are still expected to move by. share: per cell, shape
+            [cell_count].
     """
     inputs = [model.data, state.data, share, predicted, contacts_out, law]
     wp.launch(_kernels_of(model).press, (model.cell_count, _lanes(model)), inputs=inputs, device=model.device)
@@ -318,7 +318,7 @@ def solve(
 ) -> None:
     """Forces and gaps of the contacts, and the increment with them; `failed` tells of a cell without a solution.
 
-    Newton's method starts at the gaps found last.
+    It starts at the gaps found last.
 
     Args:
         start: increment with the forces that act, before the contacts answer to it.

@@ -153,7 +153,9 @@ def functions(p: Precision) -> SimpleNamespace:
             i = contacts_in.next[i]
         return load
 
-    return SimpleNamespace(gap_change=gap_change, segment_loads=segment_loads, node_loads=node_loads, body_load=body_load)
+    return SimpleNamespace(
+        gap_change=gap_change, segment_loads=segment_loads, node_loads=node_loads, body_load=body_load
+    )
 
 
 @functools.cache
@@ -242,7 +244,10 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
 
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
     """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
-    kernels, inputs = _kernels(model.precision, model.switches.body_contact), [model.data, contacts, magnitude, state.data]
+    kernels, inputs = (
+        _kernels(model.precision, model.switches.body_contact),
+        [model.data, contacts, magnitude, state.data],
+    )
     if model.one_thread_per_cell:
         wp.launch(kernels.act_on_cells, model.cell_count, inputs=inputs, device=model.device)
     else:

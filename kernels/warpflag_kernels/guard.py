@@ -325,9 +325,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     )
 
 
-def check(
-    model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None
-) -> None:
+def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None) -> None:
     """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
     `fault`.
 

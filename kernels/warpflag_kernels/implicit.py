@@ -31,13 +31,13 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-# Largest error of a node over the mean of its cell. The mean is what is followed: contacts that open, close or pass a
-# vertex make single nodes jump, which does not add up.
-import os
-PEAK = float(os.environ.get('PEAK', '1.5'))
-THETA = float(os.environ.get("THETA", "0.72"))  # where in a step the equations hold; 1 is BDF2
-LEAD = float(os.environ.get("LEAD", "0.5"))  # share of a prediction that a pose takes at most: with more, weak stiff modes grow
-GAP_SHARE = float(os.environ.get("GAP_SHARE","0.35"))  # of the error that a step may make, for what the contact law leaves over
+THETA = 0.72  # where in a step the equations hold
+# Share of the predicted correction that the first pose takes at most: with more, stiff modes of weak mobility grow.
+LEAD = 0.5
+# Error that counts over the mean of what the predictions of a cell's nodes miss. The mean is what is followed: contacts
+# that open, close or pass a vertex make single nodes jump, which does not add up.
+PEAK = 1.5
+GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
 
@@ -80,10 +80,9 @@ def kernels(p: Precision) -> SimpleNamespace:
     f = step_control.functions(p, independent=True)
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     module = p.module("implicit")
-    theta, most_lead = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(LEAD))
+    theta, most_lead, peak = (wp.constant(wp.float64(x)) for x in (THETA, LEAD, PEAK))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
-    peak = wp.constant(wp.float64(PEAK))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_law.FINEST, GAP_SHARE, GAP_GROWTH))
 
     @wp.kernel(module=module)

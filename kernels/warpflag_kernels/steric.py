@@ -48,6 +48,7 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions of contact: the force law and the closest points of two segments."""
     real, vec3 = p.real, p.vec3
     vec2 = wp.types.vector(2, real)
+
     @wp.func_native(code(p, "LAW REAL f, k; law(r, strength, diameter, f, k); return {f, k};"))
     def steric_law(r: real, strength: real, diameter: real) -> vec2:
         """Repulsion F [pN] and stiffness -dF/dr [pN/um] at distance r; r may be negative (a node below the surface)."""

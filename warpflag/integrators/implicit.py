@@ -45,9 +45,8 @@ __all__ = ["ImplicitStepper"]
 
 LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
-import os
-ROUGH = float(os.environ.get("ROUGH", "2"))
-"""How many times their tolerance is enough for gaps that only lead to the defect correction."""
+ROUGH = 2.0
+"""How many times their tolerance is enough for the gaps of the first iteration."""
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
 
@@ -154,7 +153,7 @@ class ImplicitStepper:
         self._right_hand_side(rough_velocities.serves(model))
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
-        x = self._solve(self._carried, self._found_on, ROUGH)
+        x = self._solve(self._carried, self._found_on, first=True)
         # The second, where the first one led.
         inputs = [model.data, state.data, x, self._found_on]
         wp.launch(k.take, model.element_count, inputs=inputs, device=device)
@@ -163,7 +162,7 @@ class ImplicitStepper:
         if self._touches:
             contact_search.renew(model, state, self._now, self._contacts)
         self._right_hand_side()
-        x = self._solve(self._carried_on, self._found)
+        x = self._solve(self._carried_on, self._found, first=False)
         inputs = [model.data, state.data, i, self._carried_on, self._found, self._predicted, x]
         inputs += [self._total, self._rest, s.chart]
         wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
@@ -197,12 +196,12 @@ class ImplicitStepper:
         else:
             mobility.node_velocities(model, state)
 
-    def _solve(self, last: Any, found: Any, coarse: float = 1.0) -> Any:
+    def _solve(self, last: Any, found: Any, first: bool) -> Any:
         """The increment that is still missing at the present pose.
 
         Args:
             last, found: the last increment, and what has been found of this one, carried to it.
-            coarse: how many times their tolerance is enough for the gaps.
+            first: whether this is the first iteration, whose gaps need not be as fine.
         """
         model, state, law = self._system.model, self._system.state, self._law
         inputs = [model.data, state.data, self.data, self._band, law, last, found, self._free]
@@ -211,8 +210,9 @@ class ImplicitStepper:
         banded.solve(model, state, self._band, self._free)
         if not self._touches:
             return self._free
+        coarse = ROUGH if first else 1.0
         contact_law.solve(
-            model, state, self._contacts, self._band, self._flow, self._free, law, self._step, coarse, coarse > 1.0
+            model, state, self._contacts, self._band, self._flow, self._free, law, self._step, coarse, first
         )
         return self._step
 
