@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import banded, chain, correction, hessian
+from warpflag_kernels import banded, chain, hessian, linearised
 
 from tests.helpers import anchors, cell, matrix, shaken
 from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius
@@ -72,11 +72,9 @@ class Bench:
     def force_change(self, body: Any, nodes: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """-H x: change of the body's force and torque, of the forces, and of the spin torques."""
         x = self.increment(body, nodes)
-        k = correction._kernels_of(self.model, False)
-        model, device, own = self.model.data, self.model.device, self.stepper
-        inputs = [model, own._stiffness, x, self.data]
+        k = linearised.kernels_of(self.model)
+        inputs, device = [self.model.data, self.stepper._stiffness, x, self.data], self.model.device
         wp.launch(k.joint_changes, self.count, inputs=inputs, device=device)
-        inputs = [model, own._stiffness, own._contacts, own._law, x, self.data]
         wp.launch(k.gather_changes, self.count, inputs=inputs, device=device)
         forces, torques = self.data.force.numpy().astype(float), self.data.spin_torque.numpy().astype(float)
         arms, m = self.data.position.numpy()[self.first], self.data.tangent.numpy()[self.first]

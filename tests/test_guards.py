@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from warpflag_kernels import guard
+from warpflag_kernels import contact_search, guard
 from warpflag_kernels.control import NO_FAULT
 from warpflag_kernels.guard import Fault
 
@@ -249,36 +249,49 @@ def sampled(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return crossed, nearest, turned
 
 
-def seen(sim: Simulation, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """What the guard says of these motions, one per cell."""
-    s = sim.system
+def place(sim: Simulation, nodes: np.ndarray) -> None:
+    data = sim.system.state.data
     lengths = np.ones((COUNT, 2, 3))
-    segments = np.diff(after, axis=2)
+    segments = np.diff(nodes, axis=2)
     lengths[:, :, 1:] = np.linalg.norm(segments, axis=-1)
     tangents = np.tile([0.0, 0.0, 1.0], (COUNT, 2, 3, 1))
     tangents[:, :, 1:] = segments / lengths[:, :, 1:, None]
+    data.position.assign(nodes.reshape(-1, 3))
+    data.length.assign(lengths.ravel())
+    data.tangent.assign(tangents.reshape(-1, 3))
+    data.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
+    data.active.fill_(1)
+
+
+def seen(sim: Simulation, before: np.ndarray, after: np.ndarray, looked_at: float | None) -> np.ndarray:
+    """What the guard says of these motions, one per cell.
+
+    looked_at: share of the way after which contacts have been looked for; None: they have not.
+    """
+    s, listed = sim.system, None
+    if looked_at is not None:
+        listed = sim.stepper._contacts
+        place(sim, before + looked_at * (after - before))
+        contact_search.find(s.model, s.state, sim.stepper._now, listed)
+    place(sim, after)
     s.guard.position.assign(before.reshape(-1, 3))
-    s.state.data.position.assign(after.reshape(-1, 3))
-    s.state.data.length.assign(lengths.ravel())
-    s.state.data.tangent.assign(tangents.reshape(-1, 3))
-    s.state.data.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
-    s.state.data.active.fill_(1)
     for flags in (s.chart.commit, s.chart.rest):
         flags.fill_(1)
     s.control.fault.fill_(NO_FAULT)
-    guard.check(s.model, s.state, s.chart, s.guard, s.control)
+    guard.check(s.model, s.state, s.chart, s.guard, s.control, listed)
     faults = s.control.fault.numpy()
     return np.array([code != NO_FAULT and guard.decode(int(code))[0] == Fault.CROSSING for code in faults])
 
 
-def test_crossings_are_those_of_dense_sampling(device, precision):
-    scene = cell({"flagella.length": 0.4}, precision)
+@pytest.mark.parametrize("looked_at", [None, 0.0, 0.7])
+def test_crossings_are_those_of_dense_sampling(looked_at, device, precision):
+    scene = cell({"flagella.length": 0.4, "numerics.stepper": "implicit"}, precision)
     sim = Simulation([scene] * COUNT, device=device)
     crossings = silent = 0
     for seed in range(3):
         before, after = motions(seed)
         crossed, nearest, turned = sampled(before, after)
-        answer = seen(sim, before, after)
+        answer = seen(sim, before, after, looked_at)
         assert answer[crossed].all(), np.flatnonzero(crossed & ~answer)
         away = nearest > TOUCH + CLEARANCE[precision]
         assert not answer[away].any(), np.flatnonzero(away & answer)

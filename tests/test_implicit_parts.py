@@ -1,4 +1,4 @@
-"""The parts of the implicit step, each against NumPy: stiffness, chain chart, linear solves, corrections.
+"""The parts of the implicit step, each against NumPy: stiffness, chain chart, linear solves, full equations.
 
 Kernels are driven by hand from one pose, with the buffers of the scene's own stepper. Contacts: `test_contact_law`.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from warpflag_kernels import banded, correction, elastic, flow
+from warpflag_kernels import banded, elastic, flow, linearised, mobility, rough_velocities
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, bench, close, dense_system, displacements, flat, spins
 from tests.helpers import (
@@ -103,7 +103,7 @@ def test_stiffness_times_increment_is_the_change_of_the_forces_along_the_chain_c
 
     def forces(scale: float) -> list[np.ndarray]:
         exact.retract(exact.increment(body, nodes), scale)
-        launch_right_hand_side(exact.stepper._free, exact.state)
+        launch_right_hand_side(exact.stepper._contactless, exact.state)
         d = exact.data
         return [a.numpy().copy() for a in (d.flagellum_force, d.flagellum_torque, d.force, d.spin_torque)]
 
@@ -244,24 +244,58 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
         assert close(flat(y)[part], np.linalg.solve(system, right)[part], precision, digits)
 
 
-@pytest.mark.parametrize("mode", ["all", "between"])
-def test_corrections_lead_to_the_solution_with_the_full_mobility(mode, device, precision):
-    """(1/dt + g M H) e = v without contact, whatever the weight in the matrix."""
+# The full equations.
+
+
+@pytest.mark.parametrize("mode", ["all", "between", "none"])
+def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_solution(mode, device, precision):
+    """D^-1 (1/dt + g M H) x, whatever the weight in the matrix."""
     values = {"hydrodynamics.mode": mode, "steric.enabled": False, "body.contact": False, "flagellum.1.length": 0.8}
     exact, b = (bench(values, p, device) for p in ("float64", precision))
     step, gain = 1e-5, 2 / 3
     exact.factorise(step, 1.3 * gain)
     band = b.factorise(step, 1.3 * gain)
-    velocities = np.random.default_rng(6).uniform(-1, 1, 6 + 4 * b.count)
-    velocities[(6 + 4 * b.first[:, None] + np.arange(3)).ravel()] = 0.0
+    random, fixed = np.random.default_rng(6), (6 + 4 * b.first[:, None] + np.arange(3)).ravel()
     system = np.eye(6 + 4 * b.count) / step + gain * exact.mobility() @ exact.hessian()
-    solution = np.linalg.solve(system, velocities)
-    drive = b.increment(velocities[:6], velocities[6:].reshape(-1, 4))
-    x, s = b.increment(), b.stepper
+    inverse, s = exact.local_inverse(), b.stepper
     s._law.gain.fill_(gain)
-    inputs = (b.model, b.state, s._stiffness, band, s._contacts, s._flow, s._law, drive, x, s._defect, s._scratch)
-    flow.build(b.model, b.state, s._flow)
-    for _ in range(25):
-        correction.correct(*inputs)
-    for part in (slice(0, 6), displacements(b), spins(b)):
-        assert close(flat(x)[part], solution[part], precision, 1.0, FLOW_TOLERANCE)
+    if mode != "none":
+        flow.build(b.model, b.state, s._flow)
+
+    def applied(x: np.ndarray) -> np.ndarray:
+        out = b.increment()
+        given = b.increment(x[:6], x[6:].reshape(-1, 4))
+        linearised.apply(b.model, b.state, s._stiffness, band, s._flow, s._law.gain, given, out)
+        return flat(out)
+
+    x = random.uniform(-1, 1, 6 + 4 * b.count)
+    x[fixed] = 0.0
+    parts, expected = (slice(0, 6), displacements(b), spins(b)), inverse @ system @ x
+    for part in parts:
+        assert close(applied(x)[part], expected[part], precision, 1.0, FLOW_TOLERANCE)
+    velocities = random.uniform(-1, 1, 6 + 4 * b.count)
+    velocities[fixed] = 0.0
+    solution, x = np.linalg.solve(system, velocities), np.zeros(6 + 4 * b.count)
+    for _ in range(50):
+        missing = inverse @ velocities - applied(x)
+        y = b.increment(missing[:6], missing[6:].reshape(-1, 4))
+        banded.solve(b.model, b.state, band, y)
+        x += flat(y)
+    for part in parts:
+        assert close(x[part], solution[part], precision, 1.0, FLOW_TOLERANCE)
+
+
+@pytest.mark.parametrize("mode", ["all", "within", "between"])
+def test_rough_velocities_are_those_of_the_pair_sum_in_single_precision(mode, device, precision):
+    b = bench({**UNEQUAL, "hydrodynamics.mode": mode}, precision, device)
+    if not rough_velocities.serves(b.model):
+        pytest.skip("where a thread does not sum a whole cell, no coefficients are kept")
+    flow.build(b.model, b.state, b.stepper._flow)
+    b.data.force.assign(np.random.default_rng(8).uniform(-1, 1, (b.count, 3)))
+    mobility.node_velocities(b.model, b.state)
+    free = np.setdiff1d(np.arange(b.count), b.first)
+    exact = b.data.velocity.numpy()[free].copy()
+    b.data.velocity.zero_()
+    rough_velocities.node_velocities(b.model, b.state, b.stepper._flow)
+    found = b.data.velocity.numpy()[free]
+    assert 0.0 < np.abs(found - exact).max() < 2e-6 * np.abs(exact).max()

@@ -201,7 +201,7 @@ def _kernels(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace
         stop = begin + contacts_in.count[c]
         loaded = load_all(law, begin, stop, model.steric_strength[c], model.steric_diameter[c], lane)
         loaded = block_sum(law, loaded, c, lane)
-        if not (loaded == real(0.0)):
+        if loaded != real(0.0):
             product(model, state, contacts_in, band, flow, law, c, lane)
             first = model.first_node[model.first_flagellum[c]]
             end = model.first_node[model.first_flagellum[c + 1]]

@@ -236,8 +236,9 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             return
         touch = real(0.05) * model.steric_diameter[c]
         if wp.static(listing):
-            # The same holds for contacts, of which there are fewer.
-            if real(2.0) * farthest(model, guard.strayed, c) + touch < listed_reach * model.steric_diameter[c]:
+            # What can have met between the two looks is listed, if nothing has been far from where it was looked for.
+            stood = real(2.0) * farthest(model, guard.strayed, c) + touch
+            if stood < listed_reach * model.steric_diameter[c]:
                 i = listed.start[e]
                 moved = real(0.0)
                 if i < listed.stop[e]:
@@ -247,7 +248,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
                         wp.atomic_min(control.fault, c, crossing + e)
                     i += 1
                 return
-        # What can have met between the two looks stands in the lists, if nothing has been far from where they were made.
+        # The same of the lists of neighbours.
         moved = farthest(model, guard.moved, c)
         if real(2.0) * farthest(model, guard.shifted, c) + touch < contact_reach * model.steric_diameter[c] + skin:
             i = first_later(model, near, e)

@@ -193,18 +193,25 @@ def apply(
     Args:
         gain: g, per cell, shape [cell_count].
     """
-    switches, form, device = model.switches, flow_stage.form_of(model), model.device
-    lanes = pair_sum.WARP if model.threads_cooperate and switches.pairs != "none" else 1
-    kernels = _kernels(model.precision, switches.bearing_torque, switches.pairs, form, lanes)
-    wp.launch(kernels.joint_changes, model.element_count, inputs=[model.data, stiffness, x, state.data], device=device)
+    kernels, device = kernels_of(model), model.device
     inputs = [model.data, stiffness, x, state.data]
+    wp.launch(kernels.joint_changes, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.gather_changes, model.element_count, inputs=inputs, device=device)
     wp.launch(kernels.sum_flagellum, model.flagellum_count, inputs=[model.data, state.data], device=device)
     body.move_bodies(model, state)
-    if switches.pairs != "none":
+    if model.switches.pairs != "none":
         inputs = [model.data, state.data, flow]
         wp.launch(kernels.load_nodes, model.element_count, inputs=inputs, device=device)
-        if form != "gathered":
+        if flow_stage.form_of(model) != "gathered":
             wp.launch(kernels.add_flows, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, flow, band, gain, x, out]
-    wp.launch(kernels.complete, (model.element_count, lanes), inputs=inputs, device=device)
+    wp.launch(kernels.complete, (model.element_count, _lanes(model)), inputs=inputs, device=device)
+
+
+def kernels_of(model: DeviceModel) -> SimpleNamespace:
+    switches = model.switches
+    return _kernels(model.precision, switches.bearing_torque, switches.pairs, flow_stage.form_of(model), _lanes(model))
+
+
+def _lanes(model: DeviceModel) -> int:
+    return pair_sum.WARP if model.threads_cooperate and model.switches.pairs != "none" else 1

@@ -14,7 +14,7 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 @functools.cache
 def _kernel(p: Precision, pairs: str) -> Any:
-    real, vec3 = p.real, p.vec3
+    real = p.real
     Model, State, Flow = structs(p).Model, structs(p).State, flow_stage.struct(p)
     flows = flow_stage.functions(p, pairs, "kept")
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end

@@ -1,9 +1,10 @@
 """How strongly the flows outside the matrix act: the over-implicitness that keeps a step stable, measured.
 
 The matrix of an implicit step holds the local mobility alone. With the full one, M, a stiff mode is kappa times as
-fast as the matrix takes it to be: side by side, filaments carry each other along. A step of two iterations leaves (1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest
-eigenvalue of w P (1/dt + g M H), P the solution with the matrix; a power iteration follows it, one product every few
-steps, from a direction that the cell keeps.
+fast as the matrix takes it to be: side by side, filaments carry each other along. A step of two iterations leaves
+(1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest eigenvalue of
+w P (1/dt + g M H), P the solution with the matrix; a power iteration follows it, one product every few steps, from a
+direction that the cell keeps.
 """
 
 import functools

@@ -30,7 +30,6 @@ from warpflag_kernels import (
     secant,
     stability,
 )
-from warpflag_kernels.types import structs
 
 from warpflag.integrators.stepper import (
     DEFAULT_ACCURACY,
