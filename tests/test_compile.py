@@ -83,6 +83,7 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
+    on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.

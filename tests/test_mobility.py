@@ -276,8 +276,8 @@ def test_float32_pairs_in_a_float32_run_are_what_it_has_anyway():
     )
 
 
-# The implicit stepper finds flows of force changes in single precision.
-@pytest.mark.parametrize("stepper, apart", [("rkc", 1e-9), ("implicit", 1e-8)])
+# The implicit stepper finds flows of force changes in single precision, and all flows of its first iteration.
+@pytest.mark.parametrize("stepper, apart", [("rkc", 1e-9), ("implicit", 1e-6)])
 def test_fast_and_strict_builds_agree(stepper, apart, device):
     """Reassociation and fused operations change the last digits and nothing else: forces and velocities of a state in
     contact, and where the nodes are after a millisecond in which the motors turn nine times."""

@@ -16,9 +16,10 @@ from warpflag.simulation import CellState, Simulation
 
 ZIPPING = load(Path(__file__).parent.parent / "examples" / "zipping.toml")
 DURATION = 2e-3  # s
-# Largest distance of a node from where float64 puts it [um]: of float64 itself a millimetre away, where the implicit
-# stepper's flows of force changes, in single precision, round differently; of float32.
-TOLERANCE = {"float64": 1e-8, "float32": 1e-4}
+# Largest distance of a node from where float64 puts it [um]: of float64 itself a millimetre away, where what the
+# implicit stepper finds in single precision, flows of force changes and those of its first iteration, rounds
+# differently; of float32.
+TOLERANCE = {"float64": 1e-6, "float32": 1e-4}
 FAR = np.array([600.0, -500.0, 624.5])  # um; a millimetre
 
 

@@ -5,8 +5,9 @@ the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it p
 
     e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
 
-and the whole step is w delta + e/rho. theta = 1 is BDF2; its error goes as 3 theta^2 - 1, and stiff modes are damped
-for any theta above 2^-1/2. Both iterations evaluate V once, at the pose known so far, and solve for what is missing:
+and the whole step is w delta + e/rho. The error goes as 3 theta^2 - 1, and stiff modes are damped for any theta above
+2^-1/2, but ring for a while below 1. So a step whose end is looked at from outside takes theta = 1, which is BDF2 and
+leaves them where they belong. Both iterations evaluate V once, at the pose known so far, and solve for what is missing:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
@@ -31,12 +32,13 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-THETA = 0.72  # where in a step the equations hold
-# Share of the predicted correction that the first pose takes at most: with more, stiff modes of weak mobility grow.
-LEAD = 0.5
-# Error that counts over the mean of what the predictions of a cell's nodes miss. The mean is what is followed: contacts
-# that open, close or pass a vertex make single nodes jump, which does not add up.
-PEAK = 1.5
+THETA = 0.72  # where in a step the equations hold, unless its end is looked at from outside
+# Share of the predicted correction that the first pose takes at most: with more, stiff modes of weak mobility grow, of
+# which three flagella or more have some.
+LEAD, LEAD_OF_CROWD = 0.7, 0.5
+# Error that counts over the mean of what the predictions of a cell's nodes miss, for theta = 1. The mean is what is
+# followed: contacts that open, close or pass a vertex make single nodes jump, which does not add up.
+PEAK = 5.4
 GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
@@ -53,6 +55,7 @@ def struct(p: Precision) -> Any:
         step_before: wp.array(dtype=wp.float64)  # [s]
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
+        theta: wp.array(dtype=wp.float64)  # where in the step the equations hold
         reach: wp.array(dtype=wp.float64)  # rho
         curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
@@ -80,7 +83,8 @@ def kernels(p: Precision) -> SimpleNamespace:
     f = step_control.functions(p, independent=True)
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     module = p.module("implicit")
-    theta, most_lead, peak = (wp.constant(wp.float64(x)) for x in (THETA, LEAD, PEAK))
+    inside, peak = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(PEAK))
+    most_lead, most_of_crowd = wp.constant(wp.float64(LEAD)), wp.constant(wp.float64(LEAD_OF_CROWD))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_law.FINEST, GAP_SHARE, GAP_GROWTH))
@@ -108,18 +112,23 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = wp.float64(0.0)
         if imp.history[c] > 0:
             w = dt / imp.last_step[c]
+        theta = inside
+        if dt >= left:
+            theta = one
         mu = w / (one + w)
         rho = theta * (one - (one - theta) * mu)
         g = rho / (one + (wp.float64(2.0) * theta - one) * mu)
         control.step[c] = dt
         imp.ratio[c] = w
+        imp.theta[c] = theta
         imp.reach[c] = rho
         imp.curved[c] = wp.float64(0.0)
         imp.ratio_before[c] = wp.float64(0.0)
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
             imp.curved[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
-        imp.lead[c] = wp.min(imp.trust[c], most_lead)
+        crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
+        imp.lead[c] = wp.min(imp.trust[c], wp.where(crowd, most_of_crowd, most_lead))
         imp.beyond[c] = imp.trust[c] - imp.lead[c]
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
@@ -155,7 +164,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         scale = real(imp.curved[c])
         ratio = real(imp.ratio_before[c])
         lead = real(imp.lead[c])
-        ahead = real(theta * imp.ratio[c])
+        ahead = real(imp.theta[c] * imp.ratio[c])
         x = scale * (last.node[e] - ratio * before.node[e])
         predicted.node[e] = x
         found.node[e] = lead * x
@@ -242,7 +251,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         w = real(imp.ratio[c])
-        ahead = real(theta * imp.ratio[c])
+        ahead = real(imp.theta[c] * imp.ratio[c])
         whole = real(wp.float64(1.0) / imp.reach[c])
         missed = real(0.0)
         foreseen = real(0.0)
@@ -305,7 +314,9 @@ def kernels(p: Precision) -> SimpleNamespace:
             foreseen += wp.float64(imp.predicted[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
-        error = peak * missed / wp.float64(nodes)
+        theta = imp.theta[c]
+        truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
+        error = peak * truncated * missed / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):

@@ -114,7 +114,7 @@ class ImplicitStepper:
         secant.allocate(p, cells, len(self._contacts.gap), device, self._law)
         i = implicit.struct(p)()
         i.over_implicit = zeros(cells, wp.float64)
-        i.last_step, i.step_before, i.ratio, i.reach = (zeros(cells, wp.float64) for _ in range(4))
+        i.last_step, i.step_before, i.ratio, i.theta, i.reach = (zeros(cells, wp.float64) for _ in range(5))
         i.curved, i.ratio_before = zeros(cells, wp.float64), zeros(cells, wp.float64)
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
         i.history, i.accepted, i.evaluations = (zeros(cells, wp.int32) for _ in range(3))
