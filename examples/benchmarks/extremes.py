@@ -72,7 +72,8 @@ def run(scene: Scene, start: InitialState, duration: float) -> tuple[np.ndarray 
         sim.advance(duration)
     except NumericalError as error:
         return None, int(sim.steps[0]), (time.process_time() - begun) / duration, str(error).split(";")[0]
-    return sim.cell_state().positions, int(sim.steps[0]), (time.process_time() - begun) / duration, "ran"
+    cost = (time.process_time() - begun) / duration
+    return sim.cell_state().positions, int(sim.steps[0]), cost, "ran"
 
 
 def stretch(scene: Scene, positions: np.ndarray) -> float:

@@ -32,13 +32,13 @@ from warpflag_kernels.guard import Fault, encode
 from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
-THETA = 0.72  # where in a step the equations hold, unless its end is looked at from outside
+THETA = 0.8  # where in a step the equations hold, unless its end is looked at from outside
 # Share of the predicted correction that the first pose takes at most: with more, stiff modes of weak mobility grow, of
 # which three flagella or more have some.
 LEAD, LEAD_OF_CROWD = 0.7, 0.5
 # Error that counts over the mean of what the predictions of a cell's nodes miss, for theta = 1. The mean is what is
 # followed: contacts that open, close or pass a vertex make single nodes jump, which does not add up.
-PEAK = 5.4
+PEAK = 6.1
 GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
