@@ -18,7 +18,7 @@ from warpflag.scene import with_values
 from warpflag.simulation import NumericalError, Simulation
 
 # Node error over `numerics.accuracy` per simulated ms, at most and at least; both precisions.
-SHARE, WASTE = 2.0, 0.05
+SHARE, WASTE = 2.0, 0.03
 
 DURATION = 1e-3
 
