@@ -89,7 +89,9 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
         "share",
     ):
         setattr(law, name, zeros(total, p.real))
-    law.on_first, law.on_second, law.on_node = (zeros(elements, p.vec3) for _ in range(3))
+    law.on_node = zeros(elements, p.vec3)
+    if model.threads_cooperate:
+        law.on_first, law.on_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
     law.on_body = zeros(model.flagellum_count, vec6)
     law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)
     law.partial = zeros(cells * LANES, p.real)

@@ -1,8 +1,9 @@
 """Flows that changes of forces cause within an implicit step: the pair sum, many times over at the same positions.
 
 Contact forces need it, since two filaments that push each other apart drag the fluid between them along, which makes
-the gap several times harder to open than local drag alone would, and so does the defect correction, for the elastic
-forces. Both are about changes within a step, so single precision is enough in either build.
+the gap several times harder to open than local drag alone would. So does the first iteration of a step for all forces,
+and the measurement of the step's stability. All are about what changes within a step, so single precision is enough in
+either build.
 
 The places of a cell hold its moving nodes, those that contacts can load first, both flagellum after flagellum. A CPU
 keeps the coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading

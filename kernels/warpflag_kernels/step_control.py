@@ -16,7 +16,7 @@ import warp as wp
 from warpflag_kernels.types import Precision
 
 SPAN = 1.0e-3  # over which independent errors add up to what may be made in it [s]
-LARGEST_GROWTH = 2.0  # of the step from one to the next; variable-step BDF2 is stable below 1 + sqrt(2)
+LARGEST_GROWTH = 2.0  # of the step from one to the next: about where two-step methods cease to be stable
 REFUSED = 25.0  # a step whose estimate is this many times the tolerance is taken again
 SAFETY = 0.8  # of the tolerance that the estimates' mean may reach
 MEMORY = 5.0e-4  # of that mean [s]

@@ -1,4 +1,4 @@
-"""Linearly implicit stepping of every cell of a system: BDF2 with exact contacts, see `warpflag_kernels.implicit`."""
+"""Linearly implicit stepping of every cell of a system, with exact contacts, see `warpflag_kernels.implicit`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ OVER_IMPLICIT_CROWD = 3.0
 
 
 class ImplicitStepper:
-    """Linearly implicit BDF2; `numerics.time_step` fixes the step, else `numerics.accuracy` controls it.
+    """Linearly implicit collocation; `numerics.time_step` fixes the step, else `numerics.accuracy` controls it.
 
     Args:
         system: what to advance.
