@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import warp as wp
 from warpflag_kernels import body, chain, contact_law, contact_search, contacts, flow, implicit
+from warpflag_kernels.types import DeviceModel
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, close, dense_solver, displacements, flat, spins
 from tests.helpers import shaken, touching_cell
@@ -439,6 +440,22 @@ def test_what_one_solution_tells_serves_the_next(name, device, precision):
         products.append(l.bench.stepper._law.products.numpy()[0] - before)
     assert 0 < products[1] < products[0]
     assert np.abs(solved[0] - solved[1]).max() < 20 * l.tolerance
+
+
+@pytest.mark.parametrize("name", ["three", "bundle"])
+def test_lanes_of_a_block_solve_the_same_law(name, monkeypatch, device, precision):
+    """As on a GPU: eight threads share every loop and wait for each other, here as fibers of a CPU."""
+    if device != "cpu":
+        pytest.skip("a GPU does it anyway")
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    monkeypatch.setattr(DeviceModel, "one_thread_per_cell", False)
+    monkeypatch.setattr(contact_law, "_lanes", lambda _model: 8)
+    l = listed(touching(CELLS[name], precision, device, seed=0))
+    law, b = l.bench.stepper._law, l.bench
+    law.on_first, law.on_second = wp.zeros_like(b.data.force), wp.zeros_like(b.data.force)
+    acting, given, start = l.own("force"), l.own("gap"), l.push(2e-3)
+    force = obeyed(l, start, acting, given, l.solve(start), precision)
+    assert (force > 0).sum() > 3
 
 
 # Where the contacts are.
