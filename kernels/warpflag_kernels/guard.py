@@ -235,28 +235,29 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
         touch = real(0.05) * model.steric_diameter[c]
-        if wp.static(listing):
-            # What can have met between the two looks is listed, if nothing has been far from where it was looked for.
-            stood = real(2.0) * farthest(model, guard.strayed, c) + touch
-            if stood < listed_reach * model.steric_diameter[c]:
-                i = listed.start[e]
-                moved = real(0.0)
-                if i < listed.stop[e]:
-                    moved = farthest(model, guard.moved, c)
-                while i < listed.stop[e]:
-                    if listed.other[i] >= 0 and met(state, guard, e, listed.other[i], moved, touch):
-                        wp.atomic_min(control.fault, c, crossing + e)
-                    i += 1
-                return
-        # The same of the lists of neighbours.
         moved = farthest(model, guard.moved, c)
-        if real(2.0) * farthest(model, guard.shifted, c) + touch < contact_reach * model.steric_diameter[c] + skin:
+        # What can have met between the two looks is listed, if nothing has been far from where it was looked for: as a
+        # contact, or as a neighbour.
+        as_contact = bool(False)
+        if wp.static(listing):
+            strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
+            as_contact = strayed < listed_reach * model.steric_diameter[c]
+        shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
+        if as_contact or shifted < contact_reach * model.steric_diameter[c] + skin:
             i = first_later(model, near, e)
-            while i < candidates(model, near, e):
-                j = candidate(model, near, e, i)
-                i += 1
+            stop = candidates(model, near, e)
+            if as_contact:
+                i = listed.start[e]
+                stop = listed.stop[e]
+            while i < stop:
+                j = int(-1)
+                if as_contact:
+                    j = listed.other[i]
+                if not as_contact:
+                    j = candidate(model, near, e, i)
                 if j >= 0 and met(state, guard, e, j, moved, touch):
                     wp.atomic_min(control.fault, c, crossing + e)
+                i += 1
             return
         reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
         other = k + 1
