@@ -25,7 +25,7 @@ from warpflag_kernels.compliance import LANES, meet, struct
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 ITERATIONS = 60
-FINEST = 1.0e-5  # gaps are not solved for any finer [sigma]
+FINEST = 1.0e-6  # gaps are not solved for any finer [sigma]
 STIFFENING = 0.25  # of a contact's compliance from local drag, for what else holds it
 DEEP = 0.75  # a solution begins where such a contact would settle alone [sigma]
 DEEPEST = 0.9  # predicted gaps count for no less: what overlaps deeply will have moved apart [sigma]

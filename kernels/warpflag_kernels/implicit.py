@@ -33,12 +33,9 @@ from warpflag_kernels.step_control import StepControl
 from warpflag_kernels.types import Precision, structs
 
 THETA = 0.8  # where in a step the equations hold, unless its end is looked at from outside
-# Share of the predicted correction that the first pose takes at most: with more, stiff modes of weak mobility grow, of
-# which three flagella or more have some.
-LEAD, LEAD_OF_CROWD = 0.7, 0.5
 # Error that counts over the mean of what the predictions of a cell's nodes miss, for theta = 1. The mean is what is
 # followed: contacts that open, close or pass a vertex make single nodes jump, which does not add up.
-PEAK = 6.1
+PEAK = 7.0
 GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
 GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
 
@@ -56,11 +53,10 @@ def struct(p: Precision) -> Any:
         history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
         theta: wp.array(dtype=wp.float64)  # where in the step the equations hold
+        ahead: wp.array(dtype=wp.float64)  # theta w
         reach: wp.array(dtype=wp.float64)  # rho
         curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
-        lead: wp.array(dtype=wp.float64)  # share of a prediction that the first pose takes
-        beyond: wp.array(dtype=wp.float64)  # trust beyond that
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
         missed: wp.array(dtype=real)  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
         predicted: wp.array(dtype=real)  # [K], lengths of the displacements predicted for it, their sum [um]
@@ -84,7 +80,6 @@ def kernels(p: Precision) -> SimpleNamespace:
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     module = p.module("implicit")
     inside, peak = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(PEAK))
-    most_lead, most_of_crowd = wp.constant(wp.float64(LEAD)), wp.constant(wp.float64(LEAD_OF_CROWD))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_law.FINEST, GAP_SHARE, GAP_GROWTH))
@@ -121,15 +116,13 @@ def kernels(p: Precision) -> SimpleNamespace:
         control.step[c] = dt
         imp.ratio[c] = w
         imp.theta[c] = theta
+        imp.ahead[c] = theta * w
         imp.reach[c] = rho
         imp.curved[c] = wp.float64(0.0)
         imp.ratio_before[c] = wp.float64(0.0)
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
             imp.curved[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
-        crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-        imp.lead[c] = wp.min(imp.trust[c], wp.where(crowd, most_of_crowd, most_lead))
-        imp.beyond[c] = imp.trust[c] - imp.lead[c]
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
@@ -152,28 +145,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         before: Increment,
         # Out:
         predicted: Increment,
-        found: Increment,
-        way: Increment,
     ):
-        """What e is on a path that is quadratic in time, as the last two increments say; how much of it is taken for
-        found, and the way to the first pose."""
+        """What e is on a path that is quadratic in time, as the last two increments say."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
         scale = real(imp.curved[c])
         ratio = real(imp.ratio_before[c])
-        lead = real(imp.lead[c])
-        ahead = real(imp.theta[c] * imp.ratio[c])
-        x = scale * (last.node[e] - ratio * before.node[e])
-        predicted.node[e] = x
-        found.node[e] = lead * x
-        way.node[e] = ahead * last.node[e] + lead * x
+        predicted.node[e] = scale * (last.node[e] - ratio * before.node[e])
         if e == model.first_node[model.first_flagellum[c]]:
-            b = scale * (last.body[c] - ratio * before.body[c])
-            predicted.body[c] = b
-            found.body[c] = lead * b
-            way.body[c] = ahead * last.body[c] + lead * b
+            predicted.body[c] = scale * (last.body[c] - ratio * before.body[c])
 
     @wp.kernel(module=module)
     def right_hand_side(
@@ -211,24 +193,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
 
     @wp.kernel(module=module)
-    def take(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        x: Increment,
-        # Out:
-        found: Increment,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        found.node[e] = found.node[e] + x.node[e]
-        if e == model.first_node[model.first_flagellum[c]]:
-            found.body[c] = found.body[c] + x.body[c]
-
-    @wp.kernel(module=module)
     def complete(
         # Model:
         model: Model,
@@ -251,7 +215,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         w = real(imp.ratio[c])
-        ahead = real(imp.theta[c] * imp.ratio[c])
+        ahead = real(imp.ahead[c])
         whole = real(wp.float64(1.0) / imp.reach[c])
         missed = real(0.0)
         foreseen = real(0.0)
@@ -386,7 +350,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         begin=begin,
         right_hand_side=right_hand_side,
         predict=predict,
-        take=take,
         complete=complete,
         decide=decide,
         keep_elements=keep_elements,

@@ -86,9 +86,9 @@ class ImplicitStepper:
             return x
 
         self._last, self._before, self._next_last, self._next_before = (increment() for _ in range(4))
-        self._predicted, self._free, self._step, self._rest = (increment() for _ in range(4))
-        self._carried, self._found, self._carried_on, self._found_on = (increment() for _ in range(4))
-        self._way, self._total = increment(), increment()
+        self._predicted, self._expected, self._found, self._nothing = (increment() for _ in range(4))
+        self._carried, self._carried_on, self._free, self._step = (increment() for _ in range(4))
+        self._total, self._rest = increment(), increment()
 
         k = hessian.struct(p)()
         k.ee, k.ff, k.fe, k.stretch = (zeros(elements, p.mat33) for _ in range(4))
@@ -119,7 +119,7 @@ class ImplicitStepper:
         i.one = wp.ones(cells, dtype=wp.float64, device=device)
         i.history, i.accepted, i.evaluations = (zeros(cells, wp.int32) for _ in range(3))
         i.missed, i.predicted = zeros(flagella, p.real), zeros(flagella, p.real)
-        i.trust, i.lead, i.beyond = (zeros(cells, wp.float64) for _ in range(3))
+        i.trust, i.ahead = zeros(cells, wp.float64), zeros(cells, wp.float64)
         self.data = i
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
@@ -140,29 +140,27 @@ class ImplicitStepper:
         inputs = [model.data, state.data, s.control, self.steps, i, band, *law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         # The first iteration, where the last steps lead.
-        inputs = [model.data, state.data, i, self._last, self._before, self._predicted, self._found, self._way]
+        inputs = [model.data, state.data, i, self._last, self._before, self._predicted]
         wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
-        carry = (self._last, self._found, self._carried, self._found_on)
-        chain.retract(model, state, self._base, i.one, self._way, self._now, carry)
+        carry = (self._last, self._predicted, self._carried, self._expected)
+        chain.retract(model, state, self._base, i.ahead, self._last, self._now, carry)
         if self._touches:
             contact_search.find(model, state, self._now, self._contacts)
-            contact_law.press(model, state, i.beyond, self._predicted, self._contacts, self._law)
+            contact_law.press(model, state, i.trust, self._expected, self._contacts, self._law)
         if model.switches.pairs != "none":
             flow.build(model, state, self._flow, self._contacts if self._touches else None)
         self._right_hand_side(rough_velocities.serves(model))
         hessian.joint_stiffness(model, state, self._stiffness)
         banded.factorise(model, state, self._stiffness, band)
-        x = self._solve(self._carried, self._found_on, first=True)
+        x = self._solve(self._carried, self._nothing, first=True)
         # The second, where the first one led.
-        inputs = [model.data, state.data, x, self._found_on]
-        wp.launch(k.take, model.element_count, inputs=inputs, device=device)
-        carry = (self._carried, self._found_on, self._carried_on, self._found)
+        carry = (self._carried, x, self._carried_on, self._found)
         chain.retract(model, state, self._now, i.one, x, self._now, carry)
         if self._touches:
             contact_search.renew(model, state, self._now, self._contacts)
         self._right_hand_side()
         x = self._solve(self._carried_on, self._found, first=False)
-        inputs = [model.data, state.data, i, self._carried_on, self._found, self._predicted, x]
+        inputs = [model.data, state.data, i, self._carried_on, self._found, self._expected, x]
         inputs += [self._total, self._rest, s.chart]
         wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
         carry = (self._total, self._carried_on, self._next_last, self._next_before)
