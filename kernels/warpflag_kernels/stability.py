@@ -17,11 +17,11 @@ from warpflag_kernels import banded, chain, linearised
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
-SHARE = 0.57  # of kappa that the over-implicitness takes
-FALL = 0.97  # of it from one look to the next at least: a power iteration comes from below
+SHARE = 0.6  # of kappa that the over-implicitness takes
+FALL = 0.985  # of it from one look to the next at least: a power iteration comes from below
 MOST = 5.0  # beyond, two iterations leave too much of what is stiff
 FIRST_LOOKS = 30  # steps after a start that are all looked at
-INTERVAL = 8  # steps between two looks later
+INTERVAL = 4  # steps between two looks later
 
 
 @functools.cache
@@ -56,6 +56,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # State:
         state: State,
         steps: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
         # Out:
         stability: Stability,
     ):
@@ -63,7 +64,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         stability.active[c] = state.active[c]
         look = int(0)
         crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-        if crowd and state.active[c] != 0 and (steps[c] < first_looks or steps[c] % interval == 0):
+        due = steps[c] < first_looks or steps[c] % interval == 0 or accepted[c] == 0
+        if crowd and state.active[c] != 0 and due:
             look = 1
             stability.due[0] = 1
         stability.look[c] = look
@@ -141,13 +143,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(schedule=schedule, mask=mask, measure=measure, choose=choose)
 
 
-def schedule(model: DeviceModel, state: DeviceState, steps: Any, stability: Any) -> None:
-    """Which cells measure in this pass, into `look` and `due`: those of three flagella or more, now and then.
+def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
+    """Which cells measure in this pass, into `look` and `due`: those of three flagella or more, now and then, and
+    whenever a step has been refused.
 
     Args:
-        steps: taken by every cell so far, shape [cell_count].
+        steps, accepted: steps taken by every cell so far, and whether the last one counted, shape [cell_count].
     """
-    inputs = [model.data, state.data, steps, stability]
+    inputs = [model.data, state.data, steps, accepted, stability]
     wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
 
 

@@ -175,7 +175,7 @@ class ImplicitStepper:
         guard.remember(model, state, s.chart, s.guard, s.control)
         inputs = [state.data, *moved, i, self._last, self._before, s.control]
         if self.stability is not None:
-            stability.schedule(model, state, i.evaluations, self.stability)
+            stability.schedule(model, state, i.evaluations, i.accepted, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         control.count_pass(s.control, device)
