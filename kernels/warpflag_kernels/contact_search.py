@@ -20,7 +20,7 @@ REACH = steric.CUTOFF + MARGIN  # of what is listed [sigma]
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
-    real = p.real
+    real, vec3 = p.real, p.vec3
     Model, State, Contacts, Pose = structs(p).Model, structs(p).State, contacts.struct(p), chain.types(p).Pose
     Neighbours = structs(p).Neighbours
     nearest, direction = steric.functions(p).nearest, steric.functions(p).direction
@@ -31,6 +31,32 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     all_slots, all_asked = wp.constant(neighbours.SLOTS), wp.constant(wp.uint64(2**64 - 1))
     reach_factor = real(REACH)
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
+
+    @wp.func(module=module)
+    def meets_at(
+        model: Model, pose: Pose, listed: Contacts, i: wp.int32, e: wp.int32, j: wp.int32,
+        at: real, at_other: real, apart: vec3, r: real,
+    ):  # fmt: skip
+        """Where and how segments e and j are in contact i, r apart."""
+        listed.at[i] = at
+        listed.at_other[i] = at_other
+        listed.gap[i] = r
+        along = pose.position[e] - pose.position[e - 1]
+        other = pose.position[j] - pose.position[j - 1]
+        listed.normal[i] = direction(apart, r, along, other, model.steric_diameter[model.cell_of[e]])
+
+    @wp.func(module=module)
+    def off_axis(model: Model, pose: Pose, e: wp.int32, c: wp.int32):
+        """From the nearest point of the body's axis to node e."""
+        axis, half = pose.body_axis[c], model.body_half_length[c]
+        return pose.position[e] - wp.clamp(wp.dot(pose.position[e], axis), -half, half) * axis
+
+    @wp.func(module=module)
+    def stands_off(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
+        """How a node is in contact i with the body, so far away from its axis."""
+        distance = wp.length(away)
+        listed.gap[i] = distance - model.body_radius[c]
+        listed.normal[i] = away / distance
 
     @wp.func(module=module)
     def visit(
@@ -77,32 +103,24 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 i = start + found
                                 listed.segment[i] = e
                                 listed.other[i] = j
-                                listed.at[i] = at
-                                listed.at_other[i] = at_other
-                                listed.gap[i] = r
+                                meets_at(model, pose, listed, i, e, j, at, at_other, apart, r)
                                 anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
                                 first = model.first_node[model.flagellum_of[j]]
                                 listed.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
-                                diameter = model.steric_diameter[c]
-                                listed.normal[i] = direction(apart, r, q1 - p1, q2 - p2, diameter)
                             found += 1
                             seen = seen | bit
                 entry += 1
                 bit = bit << wp.uint64(1)
         if wp.static(body):
-            axis = pose.body_axis[c]
-            half = model.body_half_length[c]
-            away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
-            distance = wp.length(away_from_axis)
-            if distance - model.body_radius[c] < reach:
+            away = off_axis(model, pose, e, c)
+            if wp.length(away) - model.body_radius[c] < reach:
                 if found < room:
                     i = start + found
                     listed.segment[i] = e
                     listed.other[i] = -1
                     listed.at[i] = real(1.0)
                     listed.at_other[i] = real(0.0)
-                    listed.gap[i] = distance - model.body_radius[c]
-                    listed.normal[i] = away_from_axis / distance
+                    stands_off(model, listed, i, away, c)
                 found += 1
         return found, seen
 
@@ -274,27 +292,15 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
-        q1 = pose.position[e]
         i = listed.start[e]
         while i < listed.stop[e]:
             j = listed.other[i]
             if j < 0:
-                axis = pose.body_axis[c]
-                half = model.body_half_length[c]
-                away_from_axis = q1 - wp.clamp(wp.dot(q1, axis), -half, half) * axis
-                distance = wp.length(away_from_axis)
-                listed.gap[i] = distance - model.body_radius[c]
-                listed.normal[i] = away_from_axis / distance
+                stands_off(model, listed, i, off_axis(model, pose, e, c), c)
             else:
-                p1 = pose.position[e - 1]
-                p2 = pose.position[j - 1]
-                q2 = pose.position[j]
-                at, at_other, apart = nearest(p1, q1, p2, q2)
-                r = wp.length(apart)
-                listed.at[i] = at
-                listed.at_other[i] = at_other
-                listed.gap[i] = r
-                listed.normal[i] = direction(apart, r, q1 - p1, q2 - p2, model.steric_diameter[c])
+                p1, p2 = pose.position[e - 1], pose.position[j - 1]
+                at, at_other, apart = nearest(p1, pose.position[e], p2, pose.position[j])
+                meets_at(model, pose, listed, i, e, j, at, at_other, apart, wp.length(apart))
             i += 1
 
     return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, list_cells=list_cells, renew=renew)
