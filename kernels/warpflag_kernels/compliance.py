@@ -76,18 +76,8 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
         return wp.zeros(count, dtype=dtype, device=model.device)
 
     law = struct(p)()
-    for name in (
-        "free_gap",
-        "solved_gap",
-        "residual",
-        "force",
-        "load",
-        "applied",
-        "answered",
-        "change",
-        "yielding",
-        "share",
-    ):
+    gaps, forces = ("free_gap", "solved_gap", "residual", "answered", "change"), ("force", "load", "applied")
+    for name in (*gaps, *forces, "yielding", "share"):
         setattr(law, name, zeros(total, p.real))
     law.on_node = zeros(elements, p.vec3)
     if model.threads_cooperate:

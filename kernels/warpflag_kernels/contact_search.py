@@ -236,7 +236,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         # Out:
         listed: Contacts,
     ):
-        """All of that for a cell at once."""
+        """All of that for a cell at once, for a CPU: every pair is looked at once."""
         c = wp.tid()
         if state.active[c] == 0:
             return
@@ -245,18 +245,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             e = model.first_node[k]
-            end = model.first_node[k + 1]
-            listed.start[e] = i
-            listed.stop[e] = i
-            listed.head[e] = -1
-            listed.position[e] = pose.position[e]
-            e += 1
-            while e < end:
-                room = listed.first[c + 1] - i
-                found, _seen = visit(model, pose, near, listed, e, i, room, all_asked)
-                if found > room:
-                    listed.overflow[c] = 1
-                    found = 0
+            while e < model.first_node[k + 1]:
+                found = int(0)
+                if e > model.first_node[k]:
+                    room = listed.first[c + 1] - i
+                    found, _seen = visit(model, pose, near, listed, e, i, room, all_asked)
+                    if found > room:
+                        listed.overflow[c] = 1
+                        found = int(0)
                 listed.start[e] = i
                 i += found
                 listed.stop[e] = i

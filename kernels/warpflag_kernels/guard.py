@@ -8,6 +8,7 @@ may pass through each other.
 """
 
 import functools
+import math
 from enum import IntEnum
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ from warpflag_kernels.control import STEP_TOLERANCE, Control
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 LARGEST_STRAIN = 0.05
-LARGEST_TWIST = 0.5 * 3.141592653589793  # per joint [rad]: where its cosine vanishes
+LARGEST_TWIST = 0.5 * math.pi  # per joint [rad]
 SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
 LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
 ELEMENT_BITS = 26
@@ -79,7 +80,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
     Contacts, listed_reach = contacts.struct(p), wp.constant(real(contact_search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
-    largest_strain, least_cosine, smallest_fold = real(LARGEST_STRAIN), real(0.0), real(SMALLEST_FOLD)
+    largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
+    least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)

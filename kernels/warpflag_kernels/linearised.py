@@ -209,6 +209,7 @@ def apply(
 
 
 def kernels_of(model: DeviceModel) -> SimpleNamespace:
+    """The kernels of `apply` for this model's switches."""
     switches = model.switches
     return _kernels(model.precision, switches.bearing_torque, switches.pairs, flow_stage.form_of(model), _lanes(model))
 

@@ -14,19 +14,13 @@ from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
-    """Device functions: velocities of one node, and of all nodes of a cell."""
-    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
-    module = p.module("mobility_functions", _variant(p, pair, pairs, form))
-    sums = pair_sum.functions(p, pair, pairs, form)
-    add_cell, flow_at = sums.add_cell, sums.flow_at
+def local(p: Precision) -> SimpleNamespace:
+    """Device function of the local drag alone."""
+    Model, State = structs(p).Model, structs(p).State
 
-    @wp.func(module=module)
-    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, lane: wp.int32):
-        """Velocity of node e of flagellum k of cell c; the lanes of a warp share its pairs."""
-        if e == model.first_node[k]:
-            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
-            return
+    @wp.func(module=p.module("mobility_local"))
+    def drag_velocity(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Velocity of node e of flagellum k, not r_0, that its own force causes [um/s]."""
         t = state.tangent[e]
         square = p.real(1.0)
         if e + 1 < model.first_node[k + 1]:
@@ -34,7 +28,28 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
             square = wp.dot(t, t)
         force = state.force[e]
         along = (wp.dot(t, force) / square) * t
-        v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
+        return model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
+
+    return SimpleNamespace(drag_velocity=drag_velocity)
+
+
+@functools.cache
+def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
+    """Device functions: velocities of one node, and of all nodes of a cell."""
+    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
+    module = p.module("mobility_functions", _variant(p, pair, pairs, form))
+    sums = pair_sum.functions(p, pair, pairs, form)
+    add_cell, flow_at = sums.add_cell, sums.flow_at
+
+    drag_velocity = local(p).drag_velocity
+
+    @wp.func(module=module)
+    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, lane: wp.int32):
+        """Velocity of node e of flagellum k of cell c; the lanes of a warp share its pairs."""
+        if e == model.first_node[k]:
+            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
+            return
+        v = drag_velocity(model, state, e, k)
         if wp.static(pairs != "none"):
             v += model.pair_mobility[c] * flow_at(model, s, e, k, c, lane)
         if lane == 0:

@@ -1,6 +1,6 @@
 """Velocities of all nodes in single precision, through the coefficients that the contact law keeps anyway.
 
-For the first of a step's two iterations, whose errors the second one takes out: a quarter of the time of the pair sum.
+For the first of a step's two iterations, whose errors the second one takes out.
 """
 
 import functools
@@ -9,14 +9,15 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels import flow as flow_stage
+from warpflag_kernels import mobility
 from warpflag_kernels.types import DeviceModel, DeviceState, Precision, structs
 
 
 @functools.cache
 def _kernel(p: Precision, pairs: str) -> Any:
-    real = p.real
     Model, State, Flow = structs(p).Model, structs(p).State, flow_stage.struct(p)
     flows = flow_stage.functions(p, pairs, "kept")
+    drag_velocity = mobility.local(p).drag_velocity
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
 
     @wp.kernel(module=p.module("rough_velocities", pairs))
@@ -43,17 +44,9 @@ def _kernel(p: Precision, pairs: str) -> Any:
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             e = model.first_node[k] + 1
-            last = model.first_node[k + 1] - 1
-            while e <= last:
-                t = state.tangent[e]
-                square = real(1.0)
-                if e < last:
-                    t += state.tangent[e + 1]
-                    square = wp.dot(t, t)
-                force = state.force[e]
-                along = (wp.dot(t, force) / square) * t
-                v = model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
-                state.velocity[e] = v + flow_at(model, flow, e, k, c, stop, 0)
+            while e < model.first_node[k + 1]:
+                flowing = flow_at(model, flow, e, k, c, stop, 0)
+                state.velocity[e] = drag_velocity(model, state, e, k) + flowing
                 e += 1
             k += 1
 
@@ -66,6 +59,10 @@ def serves(model: DeviceModel) -> bool:
 
 
 def node_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
-    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces."""
+    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces.
+
+    Args:
+        flow: the struct `Flow`, built for this pose; its forces are overwritten.
+    """
     kernel = _kernel(model.precision, model.switches.pairs)
     wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)

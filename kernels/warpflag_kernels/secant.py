@@ -4,10 +4,9 @@ Of a load that has been applied once the answer is known, and of whatever loads 
 what is new of a load beside the earlier ones, orthogonal to them, and what W makes of it beyond `yielding`, the
 estimate that stands in for W where nothing is known. `combine` solves the linear contact law
 
-    change + W (share/yielding) (change - residual) = 0   with   W = yielding + sum of answers x loads
+    wanted = -residual - (W - yielding) (share/yielding) wanted,    W - yielding = sum of answers x yielding loads
 
-for the shares of the known loads: a system of as many unknowns as there are loads. Once a load is known, that costs
-no product.
+for the shares of the known loads: a system of as many unknowns as there are loads, which costs no product.
 """
 
 import functools
@@ -66,14 +65,13 @@ _SYSTEM = """
             for (int j = 0; j < 4; ++j) Y[j] = column + j < n ? A + (column + j) * capacity : R;
             const REAL* __restrict__ Y0 = Y[0]; const REAL* __restrict__ Y1 = Y[1];
             const REAL* __restrict__ Y2 = Y[2]; const REAL* __restrict__ Y3 = Y[3];
-            REAL sum[4] = {0, 0, 0, 0};
             REAL s0 = 0, s1 = 0, s2 = 0, s3 = 0;
             #pragma clang loop vectorize(assume_safety)
             for (int i = 0; i < count; ++i) {
                 const REAL x = X[i] * W[i];
                 s0 += x * Y0[i]; s1 += x * Y1[i]; s2 += x * Y2[i]; s3 += x * Y3[i];
             }
-            sum[0] = s0; sum[1] = s1; sum[2] = s2; sum[3] = s3;
+            const REAL sum[4] = {s0, s1, s2, s3};
             for (int j = 0; j < 4 && column + j <= n; ++j) out[column + j] = sum[j] + (row == column + j ? 1 : 0);
         }
     }
