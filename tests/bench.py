@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels import banded, chain, hessian, linearised
+from warpflag_kernels.implicit import block_band, linearised
+from warpflag_kernels.rod import chain_chart, hessian
 
 from tests.helpers import anchors, cell, matrix, shaken
 from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius
-from warpflag.drag import spheroid_mobility
-from warpflag.geometry import InitialState
+from warpflag.model.geometry import InitialState
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
-from warpflag.simulation import Simulation
+from warpflag.scene.resistance import spheroid_mobility
 
 # Relative to the largest value of its kind, unless said otherwise: float64, float32.
 TOLERANCE = {"float64": 1e-8, "float32": 2e-3}
@@ -47,9 +48,9 @@ class Bench:
 
     def increment(self, body: Any = 0.0, nodes: Any = 0.0) -> Any:
         p, device = self.model.precision, self.model.device
-        x = chain.types(p).Increment()
+        x = chain_chart.types(p).Increment()
         x.node = wp.array(np.zeros((self.count, 4)) + nodes, dtype=p.vec4, device=device)
-        x.body = wp.array(np.zeros((1, 6)) + body, dtype=chain.types(p).vec6, device=device)
+        x.body = wp.array(np.zeros((1, 6)) + body, dtype=chain_chart.types(p).vec6, device=device)
         return x
 
     def retract(self, x: Any, scale: float = 1.0, carry: Any = None) -> Any:
@@ -57,7 +58,7 @@ class Bench:
         out, unused = self.increment(), self.increment()
         scales = wp.full(1, scale, dtype=wp.float64, device=self.model.device)
         carry = (carry or self.increment(), self.increment(), out, unused)
-        chain.retract(self.model, self.state, self.stepper._base, scales, x, self.stepper._now, carry)
+        chain_chart.retract(self.model, self.state, self.stepper._base, scales, x, self.stepper._now, carry)
         return out
 
     def factorise(self, step: float, weight: float) -> Any:
@@ -66,7 +67,7 @@ class Bench:
         band.weight.fill_(weight)
         band.singular.zero_()
         hessian.joint_stiffness(self.model, self.state, stiffness)
-        banded.factorise(self.model, self.state, stiffness, band)
+        block_band.factorise(self.model, self.state, stiffness, band)
         return band
 
     def force_change(self, body: Any, nodes: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

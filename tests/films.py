@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from tests.helpers import rotation
-from warpflag.geometry import initial_state
+from warpflag.model.geometry import initial_state
 from warpflag.record import Frame, Record
-from warpflag.recorder import Recorder
+from warpflag.record.recorder import Recorder
 from warpflag.scene import Scene, dumps, with_values
 
 FRAME_INTERVAL = 5e-5

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.geometry import InitialState, initial_state
+from warpflag.model.geometry import InitialState, initial_state
+from warpflag.run.simulation import CellState, Evaluation, Simulation
 from warpflag.scene import FlagellumSpec, Scene, with_values
-from warpflag.simulation import CellState, Evaluation, Simulation
 
 
 def cell(values: Mapping[str, Any] | None = None, precision: str = "float64") -> Scene:

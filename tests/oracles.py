@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from tests.helpers import carried, displaced, free_nodes, matrix, tangents, unit
-from warpflag.geometry import InitialState
+from warpflag.model.geometry import InitialState
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene
-from warpflag.simulation import Simulation
 
 CUTOFF = 2.0 ** (1.0 / 6.0)  # of the steric force, in diameters
 
@@ -217,7 +217,7 @@ def expected_pair_radius(scene: Scene) -> float:
 
 def device_mobility(sim: Simulation) -> np.ndarray:
     """The mobility of nodes r_1..r_N that the program's kernel applies, one column per unit force."""
-    from warpflag_kernels import mobility
+    from warpflag_kernels.fluid import node_velocity
 
     sim.evaluate()
     model, state = sim.system.model, sim.system.state
@@ -229,6 +229,6 @@ def device_mobility(sim: Simulation) -> np.ndarray:
             force = np.zeros((model.element_count, 3))
             force[node, axis] = 1.0
             state.data.force.assign(force)
-            mobility.node_velocities(model, state)
+            node_velocity.node_velocities(model, state)
             columns.append(state.data.velocity.numpy()[nodes].astype(np.float64).ravel())
     return np.stack(columns, axis=1)

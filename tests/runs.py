@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpflag import run
 from warpflag.record import Record
+from warpflag.run import run
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
-from warpflag.simulation import Simulation
 
 
 def small(values=None) -> Scene:

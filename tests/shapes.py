@@ -9,8 +9,8 @@ import numpy as np
 from tests.helpers import quaternion, rotation
 from warpflag import observables
 from warpflag.record import RECORD_NAME, Frame
-from warpflag.recorder import Recorder
-from warpflag.reporters import start_reporter
+from warpflag.record.recorder import Recorder
+from warpflag.record.reporters import start_reporter
 from warpflag.scene import Scene
 
 

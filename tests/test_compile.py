@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels.types import DeviceModel
+from warpflag_kernels.base.types import DeviceModel
 
 from tests.helpers import cell
-from warpflag.simulation import Simulation
+from warpflag.run.simulation import Simulation
 
 KERNELS = Path(warpflag_kernels.__file__).parent
 # With the scene that has every term: each term on and off, and every pair sum.
@@ -37,7 +37,7 @@ VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("rkc", "sho
 def kernels_in_source() -> set[tuple[str, str]]:
     """File and name of every function under a kernel decorator."""
     found = set()
-    for path in KERNELS.glob("*.py"):
+    for path in KERNELS.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list):
                 found.add((path.name, node.name))
@@ -72,8 +72,8 @@ def launched(
 
 def without_precision() -> set[Any]:
     """Kernels that exist once, in module scope: pictures know no precision."""
-    names = [path.stem for path in KERNELS.glob("*.py") if path.stem != "__init__"]
-    files = [importlib.import_module(f"warpflag_kernels.{name}") for name in names]
+    paths = [path.relative_to(KERNELS).with_suffix("") for path in KERNELS.rglob("*.py") if path.stem != "__init__"]
+    files = [importlib.import_module(".".join(("warpflag_kernels", *path.parts))) for path in paths]
     return {value for file in files for value in vars(file).values() if isinstance(value, wp.Kernel)}
 
 

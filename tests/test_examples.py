@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpflag import run
 from warpflag.record import Record
+from warpflag.run import run
 from warpflag.scene import load, with_values
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

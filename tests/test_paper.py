@@ -11,9 +11,9 @@ import pytest
 from tests.helpers import touching_cell
 from tests.oracles import dense_mobility
 from tests.shapes import Zipping
-from warpflag.drag import filament_mobility
-from warpflag.geometry import initial_state
+from warpflag.model.geometry import initial_state
 from warpflag.scene import with_values
+from warpflag.scene.resistance import filament_mobility
 
 pytest.importorskip("matplotlib")
 

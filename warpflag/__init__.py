@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from warpflag.record import Record
-    from warpflag.recorder import Recorder
+    from warpflag.record.recorder import Recorder
+    from warpflag.run.simulation import NumericalError, Simulation
     from warpflag.scene import Scene, SceneError, load, with_values
-    from warpflag.simulation import NumericalError, Simulation
 
 __version__ = "0.1.0"
 __all__ = [
@@ -26,12 +26,12 @@ __all__ = [
 
 # Loaded on first use, so that `import warpflag` and the command line's --help stay quick.
 _HOMES = {
-    "NumericalError": "simulation",
+    "NumericalError": "run.simulation",
     "Record": "record",
-    "Recorder": "recorder",
+    "Recorder": "record.recorder",
     "Scene": "scene",
     "SceneError": "scene",
-    "Simulation": "simulation",
+    "Simulation": "run.simulation",
     "load": "scene",
     "with_values": "scene",
 }

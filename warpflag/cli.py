@@ -15,7 +15,7 @@ from warpflag import __version__
 
 if TYPE_CHECKING:
     from warpflag.scene import Scene
-    from warpflag.usd import Shot
+    from warpflag.view.usd import Shot
 
 __all__ = ["main"]
 
@@ -48,11 +48,11 @@ def _say(message: object, status: int) -> int:
 
 
 def _bad_input() -> tuple[type[Exception], ...]:
-    from warpflag.checkpoint import CheckpointError
-    from warpflag.device import DeviceError
-    from warpflag.output import OutputError
+    from warpflag.base.device import DeviceError
+    from warpflag.base.output import OutputError
     from warpflag.record import RecordError
-    from warpflag.run_directory import RunError
+    from warpflag.run.checkpoint import CheckpointError
+    from warpflag.run.run_directory import RunError
     from warpflag.scene import SceneError
 
     return CheckpointError, DeviceError, OutputError, RecordError, RunError, SceneError
@@ -61,7 +61,7 @@ def _bad_input() -> tuple[type[Exception], ...]:
 def _located(error: Exception, options: argparse.Namespace) -> Exception:
     """The error with the scene file, which only the command knows once the scene is loaded."""
     from warpflag.scene import SceneError
-    from warpflag.scene_file import read_overrides
+    from warpflag.scene.scene_file import read_overrides
 
     if isinstance(error, SceneError) and not error.source and getattr(options, "scene", None):
         return error.located(options.scene, read_overrides(options.set))
@@ -165,7 +165,7 @@ def _run(options: argparse.Namespace) -> int:
         return _say("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
     if options.resume is not None and (options.output or options.precision):
         return _say("--resume goes on in its directory and precision; leave out -o and --precision", BAD_INPUT)
-    from warpflag import run
+    from warpflag.run import run
 
     if options.resume is not None:
         outcome = run.resume(options.resume, options.set, options.device).execute(options.quiet)
@@ -182,8 +182,8 @@ def _check(options: argparse.Namespace) -> int:
     if options.scene.endswith((".usd", ".usda", ".usdc", ".usdz")):
         return _check_movie(options.scene)
     scene = _scene(options)
-    from warpflag.check import report
-    from warpflag.faults import NumericalError
+    from warpflag.run.check import report
+    from warpflag.run.faults import NumericalError
 
     try:
         print(report(scene, options.device), end="")
@@ -193,7 +193,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _check_movie(path: str) -> int:
-    from warpflag.usd_check import problems_of
+    from warpflag.view.usd_check import problems_of
 
     found = problems_of(path)
     print("\n".join(found) or f"{path}: plays")
@@ -210,7 +210,7 @@ def _scene(options: argparse.Namespace) -> Scene:
 def _plot(options: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from warpflag import figures
+    from warpflag.view import figures
 
     names = [Path(directory).resolve().name for directory in options.directories]
     labels = names if len(set(names)) == len(names) else options.directories
@@ -222,7 +222,7 @@ def _plot(options: argparse.Namespace) -> int:
 
 
 def _render(options: argparse.Namespace) -> int:
-    from warpflag.render import render
+    from warpflag.view.render import render
 
     filmed_anew = options.color or options.follow or options.slow_down
     # Its pictures per second say how often the film looks at the movie, not how fast the movie plays.
@@ -248,8 +248,8 @@ def _export(options: argparse.Namespace) -> int:
     from contextlib import ExitStack
     from pathlib import Path
 
-    from warpflag import export, usd
     from warpflag.record import Record
+    from warpflag.view import export, usd
 
     names = {"usd": "movie.usdc", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
     path = Path(options.output or Path(options.directories[0]) / names[options.to])
@@ -268,7 +268,7 @@ def _export(options: argparse.Namespace) -> int:
 
 def _shot(options: argparse.Namespace, **more: float | None) -> Shot:
     """How a movie is to be filmed, by what was said of it."""
-    from warpflag.usd import Shot
+    from warpflag.view.usd import Shot
 
     said = {"color_by": options.color, "follow": options.follow, "slow_down": options.slow_down, **more}
     return Shot(**{name: value for name, value in said.items() if value is not None})
@@ -283,7 +283,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _devices(options: argparse.Namespace) -> int:
-    from warpflag.device import list_devices
+    from warpflag.base.device import list_devices
 
     print("\n".join(list_devices()))
     return DONE

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.geometry import InitialState, initial_state
+from warpflag.model.geometry import InitialState, initial_state
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Body, Flagella, FlagellumOverride, Scene, with_values
-from warpflag.simulation import Simulation
 
 SEGMENT = 0.2  # um, that of the zipping scene
 GOLDEN_ANGLE = 180.0 * (3.0 - math.sqrt(5.0))  # deg; turned by it, no two flagella come to lie in one row

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from warpflag import load
+from warpflag.run.simulation import Simulation
 from warpflag.scene import FlagellumOverride, Scene, with_values
-from warpflag.simulation import Simulation
 
 ACCURACY = 1e-2  # [um per ms]
 EIGHT = Path(__file__).parents[1] / "eight_flagella.toml"

@@ -32,10 +32,10 @@ import warpflag_kernels
 from cells import spread
 from cubin import Usage, usage
 from harness import table
-from warpflag_kernels.types import DeviceModel
+from warpflag_kernels.base.types import DeviceModel
 
+from warpflag.run.simulation import Simulation
 from warpflag.scene import with_values
-from warpflag.simulation import Simulation
 
 STEPPERS = ("rkc", "euler", "implicit")
 
@@ -75,7 +75,8 @@ def launched(precision: str, stepper: str) -> set[Any]:
 def without_precision() -> set[Any]:
     """Kernels in module scope: those of the pictures."""
     folder = Path(warpflag_kernels.__file__).parent
-    files = [importlib.import_module(f"warpflag_kernels.{path.stem}") for path in folder.glob("[!_]*.py")]
+    paths = [path.relative_to(folder).with_suffix("") for path in folder.rglob("[!_]*.py")]
+    files = [importlib.import_module(".".join(("warpflag_kernels", *path.parts))) for path in paths]
     return {value for file in files for value in vars(file).values() if isinstance(value, wp.Kernel)}
 
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.geometry import InitialState, initial_state
+from warpflag.model.geometry import InitialState, initial_state
+from warpflag.model.start import starting_state
+from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import FlagellumOverride, Scene, with_values
-from warpflag.simulation import NumericalError, Simulation
-from warpflag.start import starting_state
 
 ACCURACY = 5e-3
 # Changed values, simulated time [s].

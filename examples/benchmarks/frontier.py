@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.geometry import InitialState
+from warpflag.model.geometry import InitialState
+from warpflag.run.simulation import Simulation
 from warpflag.scene import FlagellumOverride, Scene, dumps, with_values
-from warpflag.simulation import Simulation
 
 DURATION = 1.0e-3
 WINDOWS = {"free": 20e-6, "contact": 5.5e-3}  # where they begin [s]

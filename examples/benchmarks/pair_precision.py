@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from cells import placed, shaken, shape, spread
 from harness import Contender, Repeated, interleaved, table
-from warpflag_kernels import mobility
+from warpflag_kernels.fluid import node_velocity
 
-from warpflag.geometry import InitialState
+from warpflag.model.geometry import InitialState
+from warpflag.run.simulation import Simulation
 from warpflag.scene import load, with_values
-from warpflag.simulation import Simulation
 
 ZIPPING = load(Path(__file__).parents[1] / "zipping.toml")
 SIZES = {60: (2, 30), 240: (8, 30), 1000: (10, 100), 5000: (100, 50)}  # flagella, segments of each
@@ -59,12 +59,12 @@ def velocities(sim: Simulation) -> np.ndarray:
     data.force.assign(np.random.default_rng(1).standard_normal((model.element_count, 3)))
     data.body_velocity.zero_()
     data.body_spin.zero_()
-    mobility.node_velocities(model, sim.system.state)
+    node_velocity.node_velocities(model, sim.system.state)
     return data.velocity.numpy().astype(np.float64)
 
 
 def launched(sim: Simulation) -> Contender:
-    return Repeated(lambda: mobility.node_velocities(sim.system.model, sim.system.state))
+    return Repeated(lambda: node_velocity.node_velocities(sim.system.model, sim.system.state))
 
 
 def runs() -> list[list[object]]:

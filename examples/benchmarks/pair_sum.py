@@ -35,10 +35,10 @@ import numpy as np
 from cells import moving_nodes, placed, shaken, spread
 from harness import Contender, Repeated, interleaved, save_plot, table
 from native import NativePairSum, compiler
-from warpflag_kernels import mobility
+from warpflag_kernels.fluid import node_velocity
 
-from warpflag.drag import filament_mobility, pair_radius
 from warpflag.scene import Scene
+from warpflag.scene.resistance import filament_mobility, pair_radius
 
 SIZES = {60: (2, 30), 100: (2, 50), 200: (4, 50), 1000: (10, 100), 4000: (40, 100)}  # flagella, segments of each
 PRECISIONS = ("float64", "float32")
@@ -78,7 +78,7 @@ def case(size: int, precision: str, radius: float | None = None) -> Case:
     pair = (found.velocities - drag)[moving] * 8 * np.pi * scene.fluid.viscosity
 
     def launch() -> None:
-        mobility.node_velocities(model, state)
+        node_velocity.node_velocities(model, state)
 
     return Case(precision, positions[moving], found.forces[moving], pair_radius(scene), pair, launch)
 

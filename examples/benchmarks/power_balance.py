@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from warpflag.observables import closest_parameters, power_balance
+from warpflag.run.simulation import CellState, Simulation
 from warpflag.scene import FlagellumOverride, Scene, with_values
-from warpflag.simulation import CellState, Simulation
 
 BEGIN = 2e-5  # of the balance, when the filaments are wound up [s]
 

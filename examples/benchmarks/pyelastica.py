@@ -35,10 +35,10 @@ import numpy as np
 from cells import placed
 from harness import Repeated, interleaved, table
 
-from warpflag.geometry import initial_state
+from warpflag.model.geometry import initial_state
+from warpflag.model.terms import launch_right_hand_side
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
-from warpflag.simulation import Simulation
-from warpflag.stages import launch_right_hand_side
 
 try:
     import elastica

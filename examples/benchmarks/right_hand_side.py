@@ -31,13 +31,13 @@ import warp as wp
 from cells import moving_nodes, placed, shape, spread
 from harness import Contender, Repeated, interleaved, table
 from native import NativePairSum, compiler
-from warpflag_kernels import chart, placing
+from warpflag_kernels.rod import comoving_chart, reconstruction
 
-from warpflag.drag import pair_radius
-from warpflag.geometry import InitialState
+from warpflag.model.geometry import InitialState
+from warpflag.model.terms import launch_right_hand_side, right_hand_side
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, load, with_values
-from warpflag.simulation import Simulation
-from warpflag.stages import launch_right_hand_side, right_hand_side
+from warpflag.scene.resistance import pair_radius
 
 EXAMPLES = Path(__file__).parents[1]
 CONTACT_TIME = 5.5e-3  # s; the zipping scene has some ten closed contacts then
@@ -98,10 +98,10 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
     sim = placed(scene, start)
     model, state = sim.system.model, sim.system.state
     anything = wp.zeros(1, dtype=wp.int32, device="cpu")
-    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: placing.place(model, state, sim.system.chart)}
+    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: reconstruction.place(model, state, sim.system.chart)}
     for stage in right_hand_side(model.switches):
         launches[stage.name] = lambda stage=stage: stage.launch(model, state)
-    launches[RATES] = lambda: chart.increment_rates(model, state, sim.system.chart)
+    launches[RATES] = lambda: comoving_chart.increment_rates(model, state, sim.system.chart)
     launches[WHOLE] = lambda: launch_right_hand_side(model, state)
     launches[LAUNCH] = lambda: wp.launch(_nothing, model.element_count, inputs=[anything], device="cpu")
     contenders: dict[str, Contender] = {name: Repeated(launch) for name, launch in launches.items()}

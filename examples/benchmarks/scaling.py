@@ -20,7 +20,7 @@ from typing import Any
 from cells import moving_nodes, placed, spread
 from harness import Contender, Repeated, interleaved, save_plot, table
 
-from warpflag.stages import launch_right_hand_side, right_hand_side
+from warpflag.model.terms import launch_right_hand_side, right_hand_side
 
 SEGMENTS = 30
 NODES = [60, 120, 300, 600, 1200, 2400, 5100, 10200, 20010]

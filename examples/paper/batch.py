@@ -39,7 +39,7 @@ def _run(scene: Scene, directory: Path) -> str:
     import warp as wp
 
     wp.config.quiet = True
-    from warpflag import run
+    from warpflag.run import run
 
     started = (directory / "scene.toml").exists()
     job = run.resume(str(directory)) if started else run.start(scene, str(directory), "cpu")

@@ -18,8 +18,9 @@ import scenes
 import table
 from batch import run_missing
 
-from warpflag import figures, zipper
+from warpflag.model import zipper
 from warpflag.record import Record
+from warpflag.view import figures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

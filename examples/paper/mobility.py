@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from warpflag.drag import filament_mobility, pair_radius
-from warpflag.figures import COLORS, STYLE, TWO_COLUMNS
 from warpflag.observables import segment_tangents
 from warpflag.record import Record
 from warpflag.scene import loads
+from warpflag.scene.resistance import filament_mobility, pair_radius
+from warpflag.view.figures import COLORS, STYLE, TWO_COLUMNS
 
 
 def mobility(positions: np.ndarray, first_node: np.ndarray, h: float, radius: float, drag: tuple) -> np.ndarray:

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from scenes import scene
 
-from warpflag.drag import filament_mobility, pair_radius
 from warpflag.scene import Scene, SceneError, with_values
+from warpflag.scene.resistance import filament_mobility, pair_radius
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "study.csv"
@@ -108,7 +108,7 @@ def measure(values: dict, hydrodynamics: str) -> tuple[float, float, str]:
 
     wp.config.quiet = True
     from warpflag.observables import zip_time
-    from warpflag.simulation import NumericalError, Simulation
+    from warpflag.run.simulation import NumericalError, Simulation
 
     times, lengths, synchronised = [], [], float("nan")
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpflag import zipper
+from warpflag.model import zipper
 from warpflag.observables import STRAY, ZIPPED, recorded, zip_time
 from warpflag.record import Record
 

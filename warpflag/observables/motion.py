@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from warpflag.drag import SpheroidMobility, spheroid_mobility
 from warpflag.observables.arrays import Array, elapsed, flagella, unit
 from warpflag.observables.phase import segment_tangents
 from warpflag.observables.shape import helix_axis
+from warpflag.scene.resistance import SpheroidMobility, spheroid_mobility
 
 if TYPE_CHECKING:
     from warpflag.scene import Scene

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from warpflag.observables.arrays import Array, flagella
 
 if TYPE_CHECKING:
-    from warpflag.cell_state import Evaluation
+    from warpflag.record.cell_state import Evaluation
 
 __all__ = ["PowerBalance", "power_balance"]
 

@@ -1,0 +1,1 @@
+"""Precision, device arrays and clocks: what every kernel stands on."""

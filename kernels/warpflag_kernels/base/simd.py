@@ -1,0 +1,102 @@
+"""Flagella of a cell side by side, one per lane of a vector register: how a CPU takes what goes row after row.
+
+Along one flagellum every row waits for the one before; the same rows of several flagella do not wait for each other. A
+group is what fills a register: flagella of one cell. A lane that is left over repeats the last flagellum of its group,
+and so finds the same; what a lane finds beyond the end of its flagellum is not to be kept.
+
+Clang's vector types are what makes vector code of this, hence C++. A strict build takes flagella one by one, as a GPU
+does.
+"""
+
+import functools
+import itertools
+import re
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpflag_kernels.base.types import Precision
+
+REGISTER = 64  # bytes of the widest vector register
+
+
+@functools.cache
+def struct() -> Any:
+    """The struct `Groups`."""
+
+    @wp.struct
+    class Groups:
+        first_group: wp.array(dtype=wp.int32)  # [C + 1]
+        # Per group [G].
+        first: wp.array(dtype=wp.int32)  # its first flagellum
+        count: wp.array(dtype=wp.int32)  # of flagella
+        width: wp.array(dtype=wp.int32)  # lanes: a power of two
+        rows: wp.array(dtype=wp.int32)  # of its longest flagellum
+        # Where its rows begin in arrays with one number per row and lane; last: how many numbers these have [G + 1].
+        start: wp.array(dtype=wp.int32)
+
+    return Groups
+
+
+def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, device: Any) -> Any:
+    """Groups of a batch.
+
+    Args:
+        first_flagellum: first flagellum of every cell and their number, shape [cell_count + 1].
+        first_node: first node of every flagellum and their number, shape [flagellum_count + 1].
+    """
+    widest, length = REGISTER // wp.types.type_size_in_bytes(p.real), np.diff(first_node)
+    first_group, start, groups = [0], [0], []
+    for begin, end in itertools.pairwise(first_flagellum.tolist()):
+        for first in range(begin, end, widest):
+            count = min(widest, end - first)
+            width, rows = 1 << (count - 1).bit_length(), int(length[first : first + count].max())
+            groups.append((first, count, width, rows))
+            start.append(start[-1] + -(-rows * width // widest) * widest)  # every group begins with a whole register
+        first_group.append(len(groups))
+    found = struct()()
+    found.first_group, found.start = (wp.array(x, dtype=wp.int32, device=device) for x in (first_group, start))
+    for name, values in zip(("first", "count", "width", "rows"), zip(*groups, strict=True), strict=True):
+        setattr(found, name, wp.array(values, dtype=wp.int32, device=device))
+    return found
+
+
+# For group g: BODY with V, a vector of the W lanes, each with the first node and the last row of its flagellum. Nothing
+# of this is for CUDA, but a kernel that could call it must compile there.
+_GROUP = """
+#ifndef __CUDACC__
+    using R = REAL;
+    const int rows = groups.rows.data[g];
+    auto run = [&](auto zero) {
+        using V = decltype(zero);
+        constexpr int W = sizeof(V) / sizeof(R);
+        int flagellum[W], node[W], last[W], shortest = rows;
+        for (int l = 0; l < W; ++l) {
+            flagellum[l] = groups.first.data[g] + (l < groups.count.data[g] ? l : groups.count.data[g] - 1);
+            node[l] = first_node.data[flagellum[l]];
+            last[l] = first_node.data[flagellum[l] + 1] - node[l] - 1;
+            shortest = last[l] + 1 < shortest ? last[l] + 1 : shortest;
+        }
+        auto element = [&](int l, int i) { return node[l] + (i < last[l] ? i : last[l]); };
+        BODY
+    };
+    switch (groups.width.data[g]) { CASES }
+#endif
+"""
+
+
+def code(p: Precision, body: str, words: dict[str, str] | None = None) -> str:
+    """C++ of a function with arguments `groups`, `g` and `first_node`; words: what stands for what in the body.
+
+    Loops over r, c, m (rows, columns and more of small blocks) and l (lanes) are unrolled: else the blocks that they
+    index would lie in memory.
+    """
+    case = "case {0}: {{ typedef R V __attribute__((ext_vector_type({0}))); run(V(R(0))); break; }}"
+    widest = REGISTER // wp.types.type_size_in_bytes(p.real)
+    cases = " ".join(case.format(1 << i) for i in range(widest.bit_length()))
+    name = {"float64": "double", "float32": "float"}[p.name]
+    text = _GROUP.replace("BODY", body)
+    for word, value in {**(words or {}), "CASES": cases, "REAL": name}.items():
+        text = text.replace(word, value)
+    return re.sub(r"for \(int [rcml] ", r'_Pragma("clang loop unroll(full)") \g<0>', text)

@@ -1,0 +1,1 @@
+"""Contact: steric force, neighbour lists, contact search."""

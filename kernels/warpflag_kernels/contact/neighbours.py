@@ -1,0 +1,296 @@
+"""Near segments of other flagella: a list per segment that holds until something has moved by half its skin.
+
+Contact, its search for a step and the guard against crossings all ask which segments are close. A list that is a
+skin longer than the reach answers for many passes: it is built anew only when some node of the cell has moved by more
+than half the skin since. A segment in a crowd larger than its list asks all segments instead; either way the answer
+is the same, in the same order.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+
+CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
+SKIN = 0.1  # [um]
+SLOTS = 64  # segments that a list holds
+SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
+BLOCK = 16  # segments that a CPU asks at once
+
+# Segments [begin, end) of one flagellum that are near (x, y, z), listed in ascending order; returns how many the list
+# then names. A CPU asks a block of them at once: a bit for each that is near. What a block reads beyond `end` is
+# masked, and lies within the arrays, which are a block longer than there are segments.
+_LIST = """
+    const float* __restrict__ X = near.x.data; const float* __restrict__ Y = near.y.data;
+    const float* __restrict__ Z = near.z.data; const float* __restrict__ H = near.half.data;
+    int* S = near.segment.data + list;
+    #ifdef __CUDACC__
+    for (int j = begin; j < end; ++j) {
+        const float dx = x - X[j], dy = y - Y[j], dz = z - Z[j], reach = within + H[j];
+        if (dx * dx + dy * dy + dz * dz < reach * reach) {
+            if (found < SLOTS) S[found] = j;
+            ++found;
+        }
+    }
+    #else
+    for (int b = begin; b < end; b += BLOCK) {
+        unsigned hits = 0;
+        for (int l = 0; l < BLOCK; ++l) {
+            const float dx = x - X[b + l], dy = y - Y[b + l], dz = z - Z[b + l], reach = within + H[b + l];
+            hits |= (unsigned)(dx * dx + dy * dy + dz * dz < reach * reach) << l;
+        }
+        if (end - b < BLOCK) hits &= (1u << (end - b)) - 1u;
+        for (; hits; hits &= hits - 1) {
+            if (found < SLOTS) S[found] = b + __builtin_ctz(hits);
+            ++found;
+        }
+    }
+    #endif
+    return found;
+""".replace("SLOTS", str(SLOTS)).replace("BLOCK", str(BLOCK))
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
+    real, vec3 = p.real, p.vec3
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    slots, slack = wp.constant(SLOTS), wp.constant(real(SLACK))
+    module = p.module("neighbours_functions")
+
+    @wp.func(module=module)
+    def candidates(model: Model, near: Neighbours, e: wp.int32):
+        """How many segments are to be looked at for segment e."""
+        n = near.count[e]
+        if n < 0:
+            c = model.cell_of[e]
+            n = model.first_node[model.first_flagellum[c + 1]] - model.first_node[model.first_flagellum[c]]
+        return n
+
+    @wp.func(module=module)
+    def candidate(model: Model, near: Neighbours, e: wp.int32, i: wp.int32):
+        """The i-th of them, in ascending order; -1: none."""
+        if near.count[e] >= 0:
+            return near.segment[e * slots + i]
+        j = model.first_node[model.first_flagellum[model.cell_of[e]]] + i
+        k = model.flagellum_of[j]
+        if k == model.flagellum_of[e] or j == model.first_node[k]:
+            return -1
+        return j
+
+    @wp.func(module=module)
+    def first_later(model: Model, near: Neighbours, e: wp.int32):
+        """From which candidate on they are of later flagella."""
+        if near.count[e] >= 0:
+            return near.earlier[e]
+        return model.first_node[model.flagellum_of[e] + 1] - model.first_node[model.first_flagellum[model.cell_of[e]]]
+
+    @wp.func(module=module)
+    def middle(state: State, e: wp.int32):
+        return real(0.5) * (state.position[e - 1] + state.position[e])
+
+    @wp.func(module=module)
+    def next_near(longest: real, j: wp.int32, distance: real, reach: real):
+        """The next segment of a flagellum that can be near: along it, midpoints move on by no more than the lengths.
+
+        Args:
+            longest: length of its longest segment [um].
+            distance: of the midpoint of segment j [um].
+            reach: how near a segment must come, its own half length not counted [um].
+        """
+        skipped = (distance - reach) / (slack * longest) - real(0.5)
+        return j + 1 + int(wp.where(skipped > real(0.0), wp.min(skipped, real(1.0e6)), real(0.0)))  # none for NaN
+
+    @wp.func(module=module)
+    def beside(away: vec3, t: vec3, u: vec3, half_length: real, distance: real):
+        """Whether a segment lies too far from the line of another to come within a distance of it.
+
+        Args:
+            away: from the midpoint of the other to its own [um].
+            t, u: tangents, of the other and its own; half_length: its own [um].
+        """
+        along = wp.dot(away, t)
+        c = wp.dot(t, u)
+        sine = wp.sqrt(wp.max(real(1.0) - c * c, real(0.0)))
+        clear = distance + half_length * sine
+        return wp.dot(away, away) - along * along > clear * clear
+
+    return SimpleNamespace(
+        candidates=candidates,
+        candidate=candidate,
+        first_later=first_later,
+        middle=middle,
+        next_near=next_near,
+        beside=beside,
+    )
+
+
+@functools.cache
+def lists(p: Precision) -> SimpleNamespace:
+    """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
+    real = p.real
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    middle = functions(p).middle
+    slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
+    contact_reach = wp.constant(real(CONTACT_REACH))
+    # Lengths hardly change; what they do is in the skin, like what the nodes move. So is what float32 leaves of a
+    # place.
+    half_share = wp.constant(real(0.55))
+    module = p.module("neighbours_functions")
+
+    @wp.func_native(_LIST)
+    def list_some(
+        near: Neighbours,
+        list: wp.int32,
+        found: wp.int32,
+        begin: wp.int32,
+        end: wp.int32,
+        x: wp.float32,
+        y: wp.float32,
+        z: wp.float32,
+        within: wp.float32,
+    ) -> int: ...
+
+    @wp.func(module=module)
+    def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
+        """1: a node of flagellum k has moved by more than half the skin; else 0. Also notes where its segments are."""
+        left = int(0)
+        begin = model.first_node[k]
+        end = model.first_node[k + 1]
+        centre = state.position[(begin + end) / 2]
+        widest = real(0.0)
+        e = begin
+        while e < end:
+            d = state.position[e] - near.position[e]
+            if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
+                left = 1
+            if e > begin:
+                x = middle(state, e)
+                half = half_share * state.length[e]
+                near.x[e] = wp.float32(x[0])
+                near.y[e] = wp.float32(x[1])
+                near.z[e] = wp.float32(x[2])
+                near.half[e] = wp.float32(half)
+                widest = wp.max(widest, wp.length(x - centre) + half)
+            e += 1
+        near.extent[k] = widest
+        return left
+
+    @wp.func(module=module)
+    def list_near(model: Model, state: State, near: Neighbours, e: wp.int32, c: wp.int32):
+        """The list of segment e of cell c."""
+        own = model.flagellum_of[e]
+        near.position[e] = state.position[e]
+        found = int(0)
+        if e > model.first_node[own]:
+            x = middle(state, e)
+            within = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e] + skin
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                if k == own:
+                    near.earlier[e] = found
+                else:
+                    begin = model.first_node[k]
+                    end = model.first_node[k + 1]
+                    away = x - state.position[(begin + end) / 2]
+                    reach = within + near.extent[k]
+                    if wp.dot(away, away) < reach * reach:
+                        found = list_some(
+                            near, e * slots, found, begin + 1, end,
+                            wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]), wp.float32(within),
+                        )  # fmt: skip
+                k += 1
+        near.count[e] = wp.where(found <= slots, found, -1)
+
+    @wp.func(module=module)
+    def refresh_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
+        """All lists of cell c, if one of them no longer holds."""
+        stale = int(0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            stale = wp.max(stale, has_left(model, state, near, k))
+            k += 1
+        near.stale[c] = stale
+        if stale == 0:
+            return
+        e = model.first_node[model.first_flagellum[c]]
+        while e < model.first_node[model.first_flagellum[c + 1]]:
+            list_near(model, state, near, e, c)
+            e += 1
+
+    return SimpleNamespace(has_left=has_left, list_near=list_near, refresh_cell=refresh_cell)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    has_left, list_near, refresh_cell = lists(p).has_left, lists(p).list_near, lists(p).refresh_cell
+    module = p.module("neighbours")
+
+    @wp.kernel(module=module)
+    def measure(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        k = wp.tid()
+        near.left[k] = has_left(model, state, near, k)
+
+    @wp.kernel(module=module)
+    def judge(
+        # Model:
+        model: Model,
+        # Out:
+        near: Neighbours,
+    ):
+        c = wp.tid()
+        stale = int(0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            stale = wp.max(stale, near.left[k])
+            k += 1
+        near.stale[c] = stale
+
+    @wp.kernel(module=module)
+    def build(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if near.stale[c] != 0:
+            list_near(model, state, near, e, c)
+
+    @wp.kernel(module=module)
+    def refresh_cells(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        near: Neighbours,
+    ):
+        refresh_cell(model, state, near, wp.tid())
+
+    return SimpleNamespace(measure=measure, judge=judge, build=build, refresh_cells=refresh_cells)
+
+
+def refresh(model: DeviceModel, state: DeviceState) -> None:
+    """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
+    kernels, near, device = _kernels(model.precision), state.neighbours, model.device
+    inputs = [model.data, state.data, near]
+    if model.one_thread_per_cell:
+        wp.launch(kernels.refresh_cells, model.cell_count, inputs=inputs, device=device)
+        return
+    wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
+    wp.launch(kernels.judge, model.cell_count, inputs=[model.data, near], device=device)
+    wp.launch(kernels.build, model.element_count, inputs=inputs, device=device)

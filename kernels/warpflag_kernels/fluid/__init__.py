@@ -1,0 +1,1 @@
+"""Hydrodynamics: Rotne-Prager pair sum, node velocities, motion of the body."""

@@ -1,0 +1,1 @@
+"""Implicit stepping: collocation, its linear system, contact forces of a step."""

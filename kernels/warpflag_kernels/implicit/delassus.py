@@ -1,0 +1,239 @@
+"""How the contacts of a step answer to forces: products with the compliance W, without the matrix.
+
+A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda. B puts it on
+the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off.
+
+One block of threads takes one cell: on CUDA its lanes share every loop and wait for each other between them, on a CPU
+a single lane does it all.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, Precision, structs
+from warpflag_kernels.contact import contact_list
+from warpflag_kernels.implicit import block_band
+from warpflag_kernels.implicit import frozen_flow as flow_stage
+from warpflag_kernels.rod import chain_chart
+
+LANES = 128  # threads of a block on CUDA
+
+
+@wp.func_native("WP_TILE_SYNC();")
+def meet():
+    """Lanes of a block wait for each other; what one has written the others read."""
+    ...
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Law`: unknowns, work space and settings."""
+    real, vec3 = p.real, p.vec3
+    Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
+
+    @wp.struct
+    class Law:
+        # Per contact [capacity].
+        free_gap: wp.array(dtype=real)
+        solved_gap: wp.array(dtype=real)
+        residual: wp.array(dtype=real)
+        force: wp.array(dtype=real)  # what acts [pN]
+        load: wp.array(dtype=real)  # what W is applied to [pN]
+        applied: wp.array(dtype=real)  # all that it has been applied to in a solution [pN]
+        answered: wp.array(dtype=real)  # and what that has changed [um]
+        change: wp.array(dtype=real)  # W load [um]
+        yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
+        share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `yielding` alone
+        wanted: wp.array(dtype=real)  # change of the gap, less what it yields to its own force [um]
+        # What is known of W, see `quasi_newton`: loads of unit length, and their answers beyond `yielding`.
+        loads: wp.array(dtype=real)  # [KEPT * capacity]
+        answers: wp.array(dtype=real)  # [KEPT * capacity]
+        # Per element [E], flagellum [K], lane [C * LANES].
+        on_first: wp.array(dtype=vec3)  # of segment i [pN]
+        on_second: wp.array(dtype=vec3)
+        on_node: wp.array(dtype=vec3)
+        on_body: wp.array(dtype=vec6)  # [K]
+        answer: Increment  # Y load
+        partial: wp.array(dtype=real)  # of sums and maxima
+        # Per cell [C].
+        gain: wp.array(dtype=wp.float64)  # g
+        tolerance: wp.array(dtype=real)  # of a gap [um]
+        small: wp.array(dtype=real)  # [C * SMALL], the system of the shares of known loads
+        known: wp.array(dtype=wp.int32)  # how many of these there have been
+        products: wp.array(dtype=wp.int32)  # with W, so far
+        failed: wp.array(dtype=wp.int32)  # 1: not solved
+
+    return Law
+
+
+def allocate(model: DeviceModel, contacts_in: Any) -> Any:
+    """Arrays of the struct `Law`, for as many contacts as there is room for."""
+    p, cells, elements, total = model.precision, model.cell_count, model.element_count, len(contacts_in.gap)
+    vec6 = chain_chart.types(p).vec6
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=model.device)
+
+    law = struct(p)()
+    gaps, forces = ("free_gap", "solved_gap", "residual", "answered", "change"), ("force", "load", "applied")
+    for name in (*gaps, *forces, "yielding", "share"):
+        setattr(law, name, zeros(total, p.real))
+    law.on_node = zeros(elements, p.vec3)
+    if model.threads_cooperate:
+        law.on_first, law.on_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
+    law.on_body = zeros(model.flagellum_count, vec6)
+    law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)
+    law.partial = zeros(cells * LANES, p.real)
+    law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
+    law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
+    return law
+
+
+@functools.cache
+def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace:
+    """Device functions of one block of so many lanes: sums and maxima over them, and the product."""
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    Model, State = structs(p).Model, structs(p).State
+    Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
+    Flow, vec6 = flow_stage.struct(p), chain_chart.types(p).vec6
+    flows = flow_stage.functions(p, pairs, form)
+    load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
+    band_functions = block_band.functions(p)
+    body_mobility, solve_flagellum = band_functions.body_mobility, band_functions.solve_flagellum
+    drag, solve_cell, follow = band_functions.drag, band_functions.solve_cell, band_functions.follow
+    side_by_side = lanes == 1 and not p.strict
+    lever = contact_list.functions(p)
+    gap_change, body_load = lever.gap_change, lever.body_load
+    segment_loads, node_loads = lever.segment_loads, lever.node_loads
+    module = p.module("compliance", f"{pairs}_{form}_{lanes}")
+
+    @wp.func(module=module)
+    def block_sum(law: Law, value: real, c: wp.int32, lane: wp.int32):
+        if wp.static(lanes == 1):
+            return value
+        law.partial[c * lanes + lane] = value
+        meet()
+        total = real(0.0)
+        i = int(0)
+        while i < lanes:
+            total += law.partial[c * lanes + i]
+            i += 1
+        meet()
+        return total
+
+    @wp.func(module=module)
+    def block_max(law: Law, value: real, c: wp.int32, lane: wp.int32):
+        if wp.static(lanes == 1):
+            return value
+        law.partial[c * lanes + lane] = value
+        meet()
+        largest = real(0.0)
+        i = int(0)
+        while i < lanes:
+            largest = wp.max(largest, law.partial[c * lanes + i])
+            i += 1
+        meet()
+        return largest
+
+    @wp.func(module=module)
+    def product(
+        model: Model,
+        state: State,
+        contacts_in: Contacts,
+        band: Band,
+        flow: Flow,
+        law: Law,
+        c: wp.int32,
+        lane: wp.int32,
+    ):
+        """W load into `change`, Y load into `answer`."""
+        meet()
+        k_begin = model.first_flagellum[c]
+        k_end = model.first_flagellum[c + 1]
+        begin = model.first_node[k_begin]
+        end = model.first_node[k_end]
+        e = begin + lane
+        if wp.static(lanes == 1):
+            while e < end:
+                law.on_node[e] = vec3(real(0.0))
+                e += 1
+            node_loads(model, contacts_in, law.load, c, law.on_node)
+        else:
+            while e < end:
+                on_first, on_second = segment_loads(contacts_in, law.load, e)
+                law.on_first[e] = on_first
+                law.on_second[e] = on_second
+                e += lanes
+            meet()
+            e = begin + lane
+            while e < end:
+                f = law.on_second[e]
+                if e + 1 < end:
+                    f += law.on_first[e + 1]  # zero where the next element is a tripod
+                law.on_node[e] = f
+                e += lanes
+        if wp.static(pairs != "none"):
+            e = begin + lane
+            while e < end:
+                if flow.place[e] >= 0:
+                    load(flow, flow.place[e], law.on_node[e])
+                e += lanes
+        meet()
+        if wp.static(form != "gathered"):
+            spread(model, flow, c, loaded_end(model, flow, c))
+        gain = real(law.gain[c])
+        e = begin + lane
+        while e < end:
+            k = model.flagellum_of[e]
+            f = vec3(real(0.0))
+            if e > model.first_node[k]:
+                f = law.on_node[e]
+                if wp.static(pairs != "none"):
+                    f += drag(band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
+                f = gain * f
+            law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
+            e += lanes
+        meet()
+        weight = real(band.weight[c])
+        if wp.static(side_by_side):
+            solve_cell(model, band, c, law.answer)
+        k = k_begin + lane
+        while k < k_end:
+            first = model.first_node[k]
+            if wp.static(not side_by_side):
+                solve_flagellum(model, band, k, law.answer)
+            back = vec6(real(0.0))
+            for j in range(3):
+                back += wp.transpose(band.from_body[3 * k + j]) * law.answer.node[first + j]
+            on_body = body_load(model, state, contacts_in, law.load, k, law.on_node[first])
+            law.on_body[k] = gain * on_body - weight * back
+            k += lanes
+        meet()
+        if lane == 0:
+            total = vec6(real(0.0))
+            k = k_begin
+            while k < k_end:
+                total += law.on_body[k]
+                k += 1
+            force = vec3(total[0], total[1], total[2])
+            torque = vec3(total[3], total[4], total[5])
+            rate = body_mobility(model, state, c, force, torque)
+            law.answer.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
+            law.products[c] += 1
+        meet()
+        body = law.answer.body[c]
+        e = begin + lane
+        while e < end:
+            law.answer.node[e] = follow(band, e, law.answer.node[e], body)
+            e += lanes
+        meet()
+        i = contacts_in.first[c] + lane
+        stop = contacts_in.first[c] + contacts_in.count[c]
+        while i < stop:
+            law.change[i] = gap_change(model, state, contacts_in, i, law.answer)
+            i += lanes
+
+    return SimpleNamespace(block_sum=block_sum, block_max=block_max, product=product)

@@ -1,0 +1,365 @@
+"""Flows that changes of forces cause within an implicit step: the pair sum, many times over at the same positions.
+
+Contact forces need it, since two filaments that push each other apart drag the fluid between them along, which makes
+the gap several times harder to open than local drag alone would. So does the first iteration of a step for all forces,
+and the measurement of the step's stability. All are about what changes within a step, so single precision is enough in
+either build.
+
+The places of a cell hold its moving nodes, those that contacts can load first, both flagellum after flagellum. A CPU
+keeps the coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading
+them would take as long as finding them again.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.contact import contact_list
+from warpflag_kernels.fluid import node_velocity, rotne_prager
+
+KEPT = 512  # moving nodes of a cell up to which the coefficients of its pairs are kept
+
+# A row of the sum by halves over kept coefficients, the flow c f + q (q . f): pairs (i, j) for j in [begin, end).
+_ROW = """
+    const float* __restrict__ C = s.c.data + row; const float* __restrict__ A = s.qx.data + row;
+    const float* __restrict__ B = s.qy.data + row; const float* __restrict__ D = s.qz.data + row;
+    const float* __restrict__ F = s.sum.fx.data; const float* __restrict__ G = s.sum.fy.data;
+    const float* __restrict__ H = s.sum.fz.data;
+    float* __restrict__ U = s.sum.ux.data; float* __restrict__ V = s.sum.uy.data; float* __restrict__ W = s.sum.uz.data;
+    const float fi = F[i], gi = G[i], hi = H[i];
+    float ui = 0, vi = 0, wi = 0;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int j = begin; j < end; ++j) {
+        const float a = A[j], b = B[j], d = D[j], c = C[j];
+        const float from_j = a * F[j] + b * G[j] + d * H[j], from_i = a * fi + b * gi + d * hi;
+        ui += c * F[j] + from_j * a; vi += c * G[j] + from_j * b; wi += c * H[j] + from_j * d;
+        U[j] += c * fi + from_i * a; V[j] += c * gi + from_i * b; W[j] += c * hi + from_i * d;
+    }
+    U[i] += ui; V[i] += vi; W[i] += wi;
+"""
+# The coefficients of a row.
+_KEEP = """
+    float* __restrict__ C = s.c.data + row; float* __restrict__ A = s.qx.data + row;
+    float* __restrict__ B = s.qy.data + row; float* __restrict__ D = s.qz.data + row;
+    const float* __restrict__ X = s.sum.x.data; const float* __restrict__ Y = s.sum.y.data;
+    const float* __restrict__ Z = s.sum.z.data;
+    const float xi = X[i], yi = Y[i], zi = Z[i], a2 = a * a;
+    #ifndef __CUDACC__
+    #pragma clang loop vectorize(assume_safety)
+    #endif
+    for (int j = begin; j < i; ++j) {
+        const float dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
+        const float r2 = dx * dx + dy * dy + dz * dz;
+        const float inv_r = 1.0f / wp::sqrt(r2 > 0.0f ? r2 : 1.0f), inv_r2 = inv_r * inv_r, q = a2 * inv_r2;
+        const bool far = r2 > 4.0f * a2;
+        C[j] = far ? inv_r * (1.0f + q * (2.0f / 3.0f)) : (4.0f / 3.0f) / a - 0.375f / a2 * (r2 * inv_r);
+        const float along = wp::sqrt(far ? inv_r * inv_r2 * (1.0f - 2.0f * q) : 0.125f / a2 * inv_r);
+        A[j] = along * dx; B[j] = along * dy; D[j] = along * dz;
+    }
+"""
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Flow`: which node is where in the sum, and the coefficients of its pairs."""
+    PairSum, single = structs(_single(p)).PairSum, _single(p).real
+
+    @wp.struct
+    class Flow:
+        loaded: wp.array(dtype=wp.int32)  # [K], nodes that may be loaded by a contact
+        start: wp.array(dtype=wp.int32)  # [K], places of these nodes lie in [start, start + loaded)
+        rest: wp.array(dtype=wp.int32)  # [K], where those of the flagellum's other nodes begin
+        node: wp.array(dtype=wp.int32)  # [E], of a place; a cell's places begin where its elements do
+        place: wp.array(dtype=wp.int32)  # [E], of a node; -1: of r_0, which is not in the sum
+        sum: PairSum  # by place
+        # Coefficients c, q of the pairs, only where they are kept.
+        first_pair: wp.array(dtype=wp.int32)  # [C], of a cell's pairs
+        c: wp.array(dtype=single)  # [pairs], of the force [1/um]
+        qx: wp.array(dtype=single)  # [pairs], along the nodes' distance [um^-1/2]
+        qy: wp.array(dtype=single)
+        qz: wp.array(dtype=single)
+
+    return Flow
+
+
+@functools.cache
+def rows(p: Precision) -> Any:
+    """Device function: the index from which the pairs (i, j) of a row are counted by j."""
+    Flow = struct(p)
+
+    @wp.func(module=p.module("flow_rows"))
+    def row_of(flow: Flow, first: wp.int32, c: wp.int32, i: wp.int32):
+        n = i - first
+        return flow.first_pair[c] + n * (n - 1) / 2 - first
+
+    return row_of
+
+
+@functools.cache
+def functions(p: Precision, pairs: str, form: str, lanes: int = 1) -> SimpleNamespace:
+    """Device functions for one block of threads, in this order, its lanes meeting in between: `load` every node,
+    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`. Lanes: threads
+    that share what is gathered at a node, one or those of a warp."""
+    real, vec3, single = p.real, p.vec3, _single(p)
+    Model, Flow = structs(p).Model, struct(p)
+    row_of = rows(p)
+    add_row, gather_pairs = rotne_prager.rows(single, lanes).add_row, rotne_prager.rows(single, lanes).gather_pairs
+    warp_sum = rotne_prager.over_warp(single)
+    within, between = pairs in ("within", "all"), pairs in ("between", "all")
+    zero = wp.constant(single.real(0.0))
+    halves, kept = form != "gathered", form == "kept"
+    module = p.module("flow_functions", f"{pairs}_{form}_{lanes}")
+
+    @wp.func(module=module)
+    def load(flow: Flow, place: wp.int32, f: vec3):
+        """Puts a force on the node of a place [pN]."""
+        flow.sum.fx[place] = single.real(f[0])
+        flow.sum.fy[place] = single.real(f[1])
+        flow.sum.fz[place] = single.real(f[2])
+        if wp.static(halves):
+            flow.sum.ux[place] = zero
+            flow.sum.uy[place] = zero
+            flow.sum.uz[place] = zero
+
+    @wp.func(module=module)
+    def places_end(model: Model, c: wp.int32):
+        """Where the places of a cell end."""
+        return model.first_node[model.first_flagellum[c + 1]] - model.first_flagellum[c + 1] + model.first_flagellum[c]
+
+    @wp.func(module=module)
+    def loaded_end(model: Model, flow: Flow, c: wp.int32):
+        """Where the places of a cell's nodes end that contacts can load."""
+        last = model.first_flagellum[c + 1] - 1
+        return flow.start[last] + flow.loaded[last]
+
+    @wp.func_native(_ROW)
+    def add_kept_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32): ...
+
+    @wp.func(module=module)
+    def add(model: Model, flow: Flow, c: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32):
+        if begin < end:
+            if wp.static(kept):
+                first = model.first_node[model.first_flagellum[c]]
+                add_kept_row(flow, row_of(flow, first, c, i), i, begin, end)
+            else:
+                add_row(flow.sum, i, begin, end, single.real(model.pair_radius[c]))
+
+    @wp.func(module=module)
+    def spread(model: Model, flow: Flow, c: wp.int32, sources: wp.int32):
+        """The sum by halves, where one thread does a whole cell; beyond the places `sources` nothing is loaded."""
+        begin = model.first_node[model.first_flagellum[c]]
+        end = places_end(model, c)
+        i = begin
+        while i < end:
+            stop = wp.min(i, sources)
+            if wp.static(within and between):
+                add(model, flow, c, i, begin, stop)
+            else:
+                own = model.flagellum_of[flow.node[i]]
+                start = flow.start[own]
+                loaded = start + flow.loaded[own]
+                rest = flow.rest[own]
+                if wp.static(within):
+                    add(model, flow, c, i, start, wp.min(loaded, stop))
+                    add(model, flow, c, i, rest, stop)
+                else:
+                    add(model, flow, c, i, begin, wp.min(start, stop))
+                    add(model, flow, c, i, loaded, wp.min(rest, stop))
+            i += 1
+
+    @wp.func(module=module)
+    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32, lane: wp.int32):
+        """Velocity of node e of flagellum k that the forces cause through the pair sum [um/s]."""
+        i = flow.place[e]
+        ux = zero
+        uy = zero
+        uz = zero
+        if wp.static(halves):
+            ux = flow.sum.ux[i]
+            uy = flow.sum.uy[i]
+            uz = flow.sum.uz[i]
+        else:
+            begin = model.first_node[model.first_flagellum[c]]
+            radius = single.real(model.pair_radius[c])
+            u = single.vec3(zero)
+            if wp.static(within and between):
+                u = gather_pairs(flow.sum, i, begin + lane, sources, radius)
+            else:
+                start = flow.start[k]
+                loaded = start + flow.loaded[k]
+                rest = flow.rest[k]
+                others = rest + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
+                if wp.static(within):
+                    u = gather_pairs(flow.sum, i, start + lane, wp.min(loaded, sources), radius)
+                    u += gather_pairs(flow.sum, i, rest + lane, wp.min(others, sources), radius)
+                else:
+                    u = gather_pairs(flow.sum, i, begin + lane, wp.min(start, sources), radius)
+                    u += gather_pairs(flow.sum, i, loaded + lane, wp.min(rest, sources), radius)
+                    u += gather_pairs(flow.sum, i, others + lane, sources, radius)
+            if wp.static(lanes > 1):
+                u = warp_sum(u)
+            ux = u[0]
+            uy = u[1]
+            uz = u[2]
+        return model.pair_mobility[c] * vec3(real(ux), real(uy), real(uz))
+
+    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, places_end=places_end)
+
+
+@functools.cache
+def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
+    real = _single(p).real
+    Model, State, Contacts, Flow = structs(p).Model, structs(p).State, contact_list.struct(p), struct(p)
+    row_of, module = rows(p), p.module("flow", "touching" if touching else "")
+
+    @wp.func(module=module)
+    def may_be_loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
+        """Whether node e of a flagellum that ends before `end` has contacts, itself or through its segments."""
+        if wp.static(not touching):
+            return False
+        if contacts_in.stop[e] > contacts_in.start[e] or contacts_in.head[e] >= 0:
+            return True
+        return e + 1 < end and (contacts_in.stop[e + 1] > contacts_in.start[e + 1] or contacts_in.head[e + 1] >= 0)
+
+    @wp.kernel(module=module)
+    def count(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        # Out:
+        flow: Flow,
+    ):
+        k = wp.tid()
+        e = model.first_node[k] + 1
+        end = model.first_node[k + 1]
+        if state.active[model.cell_of[e]] == 0:
+            return
+        loaded = int(0)
+        while e < end:
+            if may_be_loaded(contacts_in, e, end):
+                loaded += 1
+            e += 1
+        flow.loaded[k] = loaded
+
+    @wp.kernel(module=module)
+    def arrange(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        # Out:
+        flow: Flow,
+    ):
+        own = wp.tid()
+        e = model.first_node[own] + 1
+        end = model.first_node[own + 1]
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        first = model.first_flagellum[c]
+        loaded = model.first_node[first]
+        unloaded = loaded
+        k = first
+        while k < model.first_flagellum[c + 1]:
+            unloaded += flow.loaded[k]
+            if k < own:
+                loaded += flow.loaded[k]
+                unloaded += model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
+            k += 1
+        flow.start[own] = loaded
+        flow.rest[own] = unloaded
+        while e < end:
+            place = loaded
+            if may_be_loaded(contacts_in, e, end):
+                loaded += 1
+            else:
+                place = unloaded
+                unloaded += 1
+            flow.node[place] = e
+            flow.place[e] = place
+            x = state.position[e]
+            flow.sum.x[place] = real(x[0])
+            flow.sum.y[place] = real(x[1])
+            flow.sum.z[place] = real(x[2])
+            e += 1
+
+    @wp.func_native(_KEEP)
+    def keep_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
+
+    @wp.kernel(module=module)
+    def keep(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        flow: Flow,
+    ):
+        c = wp.tid()
+        first = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        end -= model.first_flagellum[c + 1] - model.first_flagellum[c]
+        i = first
+        while i < end and state.active[c] != 0:
+            keep_row(flow, row_of(flow, first, c, i), i, first, real(model.pair_radius[c]))
+            i += 1
+
+    return SimpleNamespace(count=count, arrange=arrange, keep=keep)
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Flow`; none where forces cause no flows."""
+    flow, device = struct(model.precision)(), model.device
+    if model.switches.pairs == "none":
+        return flow
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
+    flow.node = zeros(model.element_count, wp.int32)
+    flow.place = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
+    form = form_of(model)
+    results = () if form == "gathered" else ("ux", "uy", "uz")
+    for name in ("x", "y", "z", "fx", "fy", "fz", *results):
+        setattr(flow.sum, name, zeros(model.element_count, wp.float32))
+    if form == "kept":
+        first_flagellum = model.data.first_flagellum.numpy()
+        moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
+        pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
+        flow.first_pair = wp.array(pairs[:-1], dtype=wp.int32, device=device)
+        for name in ("c", "qx", "qy", "qz"):
+            setattr(flow, name, zeros(int(pairs[-1]), wp.float32))
+    return flow
+
+
+def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
+    """Places, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
+    kernels, device = _kernels(model.precision, contacts_in is not None), model.device
+    listed = contact_list.struct(model.precision)() if contacts_in is None else contacts_in
+    inputs = [model.data, state.data, listed, flow]
+    wp.launch(kernels.count, model.flagellum_count, inputs=inputs, device=device)
+    wp.launch(kernels.arrange, model.flagellum_count, inputs=inputs, device=device)
+    if form_of(model) == "kept":
+        wp.launch(kernels.keep, model.cell_count, inputs=[model.data, state.data, flow], device=device)
+
+
+def form_of(model: DeviceModel) -> str:
+    """How the sum is done: "kept" and "halves" take every pair once, with coefficients kept or not, "gathered" at each
+    of its nodes."""
+    if not node_velocity.sums_by_halves(model):
+        return "gathered"
+    return "kept" if model.largest_cell <= KEPT else "halves"
+
+
+def _single(p: Precision) -> Precision:
+    return Precision("float32", p.strict)

@@ -1,0 +1,68 @@
+"""Velocities of all nodes in single precision, through the coefficients that the contact law keeps anyway.
+
+For the first of a step's two iterations, whose errors the second one takes out.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.fluid import node_velocity
+from warpflag_kernels.implicit import frozen_flow as flow_stage
+
+
+@functools.cache
+def _kernel(p: Precision, pairs: str) -> Any:
+    Model, State, Flow = structs(p).Model, structs(p).State, flow_stage.struct(p)
+    flows = flow_stage.functions(p, pairs, "kept")
+    drag_velocity = node_velocity.local(p).drag_velocity
+    load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
+
+    @wp.kernel(module=p.module("rough_velocities", pairs))
+    def cells(
+        # Model:
+        model: Model,
+        # State:
+        flow: Flow,
+        # Out:
+        state: State,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        begin = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        e = begin
+        while e < end:
+            if flow.place[e] >= 0:
+                load(flow, flow.place[e], state.force[e])
+            e += 1
+        stop = places_end(model, c)
+        spread(model, flow, c, stop)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k] + 1
+            while e < model.first_node[k + 1]:
+                flowing = flow_at(model, flow, e, k, c, stop, 0)
+                state.velocity[e] = drag_velocity(model, state, e, k) + flowing
+                e += 1
+            k += 1
+
+    return cells
+
+
+def serves(model: DeviceModel) -> bool:
+    """Whether the model's coefficients are kept."""
+    return model.switches.pairs != "none" and flow_stage.form_of(model) == "kept"
+
+
+def node_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
+    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces.
+
+    Args:
+        flow: the struct `Flow`, built for this pose; its forces are overwritten.
+    """
+    kernel = _kernel(model.precision, model.switches.pairs)
+    wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)

@@ -1,0 +1,183 @@
+"""How strongly the flows outside the matrix act: the over-implicitness that keeps a step stable, measured.
+
+The matrix of an implicit step holds the local mobility alone. With the full one, M, a stiff mode is kappa times as
+fast as the matrix takes it to be: side by side, filaments carry each other along. A step of two iterations leaves
+(1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest eigenvalue of
+w P (1/dt + g M H), P the solution with the matrix; a power iteration follows it, one product every few steps, from a
+direction that the cell keeps.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.implicit import block_band, linearised
+from warpflag_kernels.rod import chain_chart
+
+LEAST = 1.3  # over-implicitness at which one or two flagella are stable
+SHARE = 0.6  # of kappa that the over-implicitness takes
+FALL = 0.985  # of it from one look to the next at least: a power iteration comes from below
+MOST = 5.0  # beyond, two iterations leave too much of what is stiff
+FIRST_LOOKS = 30  # steps after a start that are all looked at
+INTERVAL = 4  # steps between two looks later
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Stability`, per cell [C] unless said otherwise."""
+    Increment = chain_chart.types(p).Increment
+
+    @wp.struct
+    class Stability:
+        kappa: wp.array(dtype=wp.float64)
+        look: wp.array(dtype=wp.int32)  # 1: this pass measures
+        active: wp.array(dtype=wp.int32)  # the state's own, while its cells are masked
+        due: wp.array(dtype=wp.int32)  # [1], 1: some cell measures in this pass
+        probe: Increment
+        size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part
+
+    return Stability
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real = p.real
+    Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
+    module = p.module("stability")
+    first_looks, interval = wp.constant(FIRST_LOOKS), wp.constant(INTERVAL)
+    least, most, share, fall = (wp.constant(wp.float64(x)) for x in (LEAST, MOST, SHARE, FALL))
+
+    @wp.kernel(module=module)
+    def schedule(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        steps: wp.array(dtype=wp.int32),
+        accepted: wp.array(dtype=wp.int32),
+        # Out:
+        stability: Stability,
+    ):
+        c = wp.tid()
+        stability.active[c] = state.active[c]
+        look = int(0)
+        crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
+        due = steps[c] < first_looks or steps[c] % interval == 0 or accepted[c] == 0
+        if crowd and state.active[c] != 0 and due:
+            look = 1
+            stability.due[0] = 1
+        stability.look[c] = look
+
+    @wp.kernel(module=module)
+    def mask(
+        # State:
+        stability: Stability,
+        # Out:
+        state: State,
+    ):
+        c = wp.tid()
+        state.active[c] = stability.look[c]
+
+    @wp.kernel(module=module)
+    def measure(
+        # Model:
+        model: Model,
+        # State:
+        answer: Increment,
+        # Out:
+        stability: Stability,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        if stability.look[model.cell_of[first]] == 0:
+            return
+        scale = real(1.0) / model.segment_length[k]
+        total = wp.float64(0.0)
+        e = first
+        while e < model.first_node[k + 1]:
+            d = answer.node[e]
+            if e == first:
+                d[0] = real(0.0)  # r_0 has no displacement of its own
+                d[1] = real(0.0)
+                d[2] = real(0.0)
+            stability.probe.node[e] = d
+            x = scale * scale * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+            total += wp.float64(x + d[3] * d[3])
+            e += 1
+        stability.size[k] = total
+
+    @wp.kernel(module=module)
+    def choose(
+        # Model:
+        model: Model,
+        # State:
+        answer: Increment,
+        # Out:
+        stability: Stability,
+        over_implicit: wp.array(dtype=wp.float64),
+        state: State,
+    ):
+        c = wp.tid()
+        state.active[c] = stability.active[c]
+        stability.due[0] = 0
+        if stability.look[c] == 0:
+            return
+        total = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            total += stability.size[k]
+            k += 1
+        ratio = wp.sqrt(total)
+        if wp.isfinite(ratio) and ratio > wp.float64(0.0):
+            stability.kappa[c] = ratio * over_implicit[c]
+            over_implicit[c] = wp.clamp(share * stability.kappa[c], wp.max(least, fall * over_implicit[c]), most)
+            scale = real(wp.float64(1.0) / ratio)
+            stability.probe.body[c] = scale * answer.body[c]
+            e = model.first_node[model.first_flagellum[c]]
+            while e < model.first_node[model.first_flagellum[c + 1]]:
+                stability.probe.node[e] = scale * stability.probe.node[e]
+                e += 1
+
+    return SimpleNamespace(schedule=schedule, mask=mask, measure=measure, choose=choose)
+
+
+def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
+    """Which cells measure in this pass, into `look` and `due`: those of three flagella or more, now and then, and
+    whenever a step has been refused.
+
+    Args:
+        steps, accepted: steps taken by every cell so far, and whether the last one counted, shape [cell_count].
+    """
+    inputs = [model.data, state.data, steps, accepted, stability]
+    wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
+
+
+def measure(
+    model: DeviceModel,
+    state: DeviceState,
+    stiffness: Any,
+    band: Any,
+    flow: Any,
+    gain: wp.array,
+    answer: Any,
+    stability: Any,
+    over_implicit: Any,
+) -> None:
+    """One power iteration of the cells that look, and their over-implicitness from it.
+
+    Args:
+        gain: g, shape [cell_count].
+        answer: increment to work in; the forces of `state` are overwritten.
+        over_implicit: shape [cell_count].
+    """
+    kernels, device = _kernels(model.precision), model.device
+    wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
+    linearised.apply(model, state, stiffness, band, flow, gain, stability.probe, answer)
+    block_band.solve(model, state, band, answer)
+    inputs = [model.data, answer, stability]
+    wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
+    inputs = [model.data, answer, stability, over_implicit, state.data]
+    wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)

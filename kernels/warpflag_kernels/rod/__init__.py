@@ -1,0 +1,1 @@
+"""Rod mechanics: rotations, elastic forces and their stiffness, charts and reconstruction."""

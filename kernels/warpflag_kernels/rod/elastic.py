@@ -1,0 +1,127 @@
+"""Elastic forces of the flagella: bend, twist and stretch of a discrete Kirchhoff rod, exact gradient.
+
+Joint i couples segments i and i + 1 with tangents t, u and strain h Omega = (w1, w2, w3):
+
+    E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|e|/h - 1)^2
+
+(the paper's Kirchhoff density; its stretching term has no rest length as printed, here it has one). The motor joint
+0 is a universal joint: no bending rigidity, no intrinsic twist, `hook_rigidity` in place of C. Directors follow a
+moving tangent by the minimal rotation, so gradients are taken with respect to segment vectors and spin angles.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.rod import rotations
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device function: the energy gradients of one joint."""
+    real = p.real
+    Model, State = structs(p).Model, structs(p).State
+    twist, angle = rotations.functions(p).twist, rotations.functions(p).angle
+
+    @wp.func(module=p.module("elastic_functions"))
+    def joint(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Joint e of flagellum k: after each of its segments but the last."""
+        per_length = real(1.0) / model.segment_length[k]
+        t = state.tangent[e]
+        u = state.tangent[e + 1]
+        a1 = state.director[e]
+        b1 = state.director[e + 1]
+        per_chi = real(1.0) / (real(1.0) + wp.dot(t, u))
+        kb = wp.cross(t, u) * (real(2.0) * per_chi)
+        sine, cosine = twist(t, u, a1, b1)
+        turned = angle(sine, cosine)
+        if e == model.first_node[k]:
+            moment = model.hook_rigidity[k] * per_length * turned
+            gradient = (real(0.5) * moment) * kb
+            state.joint_before[e] = gradient
+            state.joint_after[e] = gradient / state.length[e + 1]
+            state.joint_spin_before[e] = -moment
+            state.joint_spin_after[e] = moment
+            return
+        a2 = wp.cross(t, a1)
+        b2 = wp.cross(u, b1)
+        rest = model.rest_strain[k]
+        w1 = real(0.5) * wp.dot(kb, a1 + b1)
+        w2 = real(0.5) * wp.dot(kb, a2 + b2)
+        stiffness = model.bending_rigidity[k] * per_length
+        m1 = stiffness * (w1 - rest[0])
+        m2 = stiffness * (w2 - rest[1])
+        m3 = model.twist_rigidity[k] * per_length * (turned - rest[2])
+        common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
+        lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
+        state.joint_before[e] = (common + wp.cross(u, lever)) / state.length[e]
+        state.joint_after[e] = (common - wp.cross(t, lever)) / state.length[e + 1]
+        state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3
+        state.joint_spin_after[e] = real(0.5) * (m1 * wp.dot(kb, b2) - m2 * wp.dot(kb, b1)) + m3
+
+    return SimpleNamespace(joint=joint)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    joint, joint_strain = functions(p).joint, rotations.functions(p).joint_strain
+
+    @wp.kernel(module=p.module("elastic"))
+    def joint_gradients(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+    ):
+        e = wp.tid()
+        k = model.flagellum_of[e]
+        if e + 1 == model.first_node[k + 1] or state.active[model.cell_of[e]] == 0:
+            return  # the last segment has no joint after it: its entries stay zero
+        joint(model, state, e, k)
+
+    @wp.kernel(module=p.module("elastic_energy"))
+    def energy(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        energy_out: wp.array(dtype=vec3),
+    ):
+        e = wp.tid()
+        k = model.flagellum_of[e]
+        first = model.first_node[k]
+        h = model.segment_length[k]
+        bend = real(0.0)
+        twist = real(0.0)
+        stretch = real(0.0)
+        if e > first:
+            strain = state.length[e] / h - real(1.0)
+            stretch = real(0.5) * model.stretching_stiffness[k] * h * strain * strain
+        if e + 1 < model.first_node[k + 1]:
+            w = joint_strain(state.tangent[e], state.tangent[e + 1], state.director[e], state.director[e + 1])
+            if e == first:
+                twist = real(0.5) * model.hook_rigidity[k] / h * w[2] * w[2]
+            else:
+                d = w - model.rest_strain[k]
+                bend = real(0.5) * model.bending_rigidity[k] / h * (d[0] * d[0] + d[1] * d[1])
+                twist = real(0.5) * model.twist_rigidity[k] / h * d[2] * d[2]
+        energy_out[e] = vec3(bend, twist, stretch)
+
+    return SimpleNamespace(joint_gradients=joint_gradients, energy=energy)
+
+
+def joint_gradients(model: DeviceModel, state: DeviceState) -> None:
+    """Energy gradients of every joint, into `joint_before/after` [pN] and `joint_spin_before/after` [pN um]."""
+    kernel = _kernels(model.precision).joint_gradients
+    wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
+
+
+def elastic_energy(model: DeviceModel, state: DeviceState, energy_out: wp.array) -> None:
+    """Bending, twist and stretching energy per element [pN um], shape [element_count, 3]."""
+    kernel = _kernels(model.precision).energy
+    wp.launch(kernel, model.element_count, inputs=[model.data, state.data, energy_out], device=model.device)

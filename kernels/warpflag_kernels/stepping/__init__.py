@@ -1,0 +1,1 @@
+"""Explicit stepping, step control and guards."""

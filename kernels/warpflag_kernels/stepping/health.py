@@ -1,0 +1,357 @@
+"""Guards: finite values, strain, twist and fold of every joint, crossed centre lines.
+
+A step too long, or a load too strong, gives finite garbage long before it gives NaN. So at a start, every `interval`
+steps and where an advance ends, these kernels look at the state and note the first violated guard of the cell; the
+stepper then stops that cell. Crossings are found by following both segments of a near pair linearly from the last
+check to this one: where the four end points become coplanar, do the segments touch? Flagella without steric forces
+may pass through each other.
+"""
+
+import functools
+import math
+from enum import IntEnum
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.clock import STEP_TOLERANCE, Control
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.contact import contact_list, neighbours, search, steric
+from warpflag_kernels.rod import comoving_chart as chart_stage
+from warpflag_kernels.rod import rotations
+
+LARGEST_STRAIN = 0.05
+LARGEST_TWIST = 0.5 * math.pi  # per joint [rad]
+SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
+LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
+ELEMENT_BITS = 26
+
+
+class Fault(IntEnum):
+    """What a guard found; the lower value is reported when several fire at once."""
+
+    NOT_FINITE = 0
+    CROSSING = 1
+    STRAIN = 2
+    TWIST = 3
+    FOLD = 4
+    UNSOLVED = 5
+    TURN = 6
+
+
+def encode(kind: Fault) -> int:
+    """The fault's kind in the upper bits of the code; the element is added below."""
+    return int(kind) << ELEMENT_BITS
+
+
+def decode(code: int) -> tuple[Fault, int]:
+    """Kind and element of a fault code."""
+    return Fault(code >> ELEMENT_BITS), code & ((1 << ELEMENT_BITS) - 1)
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Guard`: what the last check saw."""
+    real, vec3 = p.real, p.vec3
+
+    @wp.struct
+    class Guard:
+        interval: wp.array(dtype=wp.int32)  # [C], steps between two checks
+        # Empty where nothing can cross.
+        position: wp.array(dtype=vec3)  # [E], at the last check [um]
+        longest: wp.array(dtype=real)  # [K], its longest segment [um]
+        moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
+        strayed: wp.array(dtype=real)  # [K], from where contacts were looked for, by a stepper that does [um]
+        shifted: wp.array(dtype=real)  # [K], its longest way from where the lists of neighbours were built [um]
+
+    return Guard
+
+
+@functools.cache
+def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    Chart, Guard = chart_stage.struct(p), struct(p)
+    twist = rotations.functions(p).twist
+    closest_parameters = steric.functions(p).closest_parameters
+    near_by = neighbours.functions(p)
+    candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
+    beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
+    Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
+    Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
+    contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
+    largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
+    least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+    not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
+    strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
+    turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
+    module = p.module("guard", "listing" if listing else "")
+
+    @wp.func(module=module)
+    def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
+        if chart.commit[c] == 0:
+            return chart.rest[c] != 0  # a start
+        left = control.target[c] - (control.time[c] + control.step[c])
+        ends = left < tolerance * control.step[c]
+        return ends or (control.steps[c] + 1) % guard.interval[c] == 0
+
+    @wp.kernel(module=module)
+    def check_elements(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        guard: Guard,
+        # Out:
+        control: Control,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or not due(control, guard, chart, c):
+            return
+        k = model.flagellum_of[e]
+        x = state.position[e]
+        director = state.director[e]
+        # Normalising turns a director that is not finite into zero.
+        directed = wp.dot(director, director) > real(0.5)
+        if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e]) and directed):
+            wp.atomic_min(control.fault, c, not_finite + e)
+            return
+        if e == model.first_node[k] and wp.abs(chart.increment[e][3]) > largest_turn:
+            wp.atomic_min(control.fault, c, turned + e)
+        if e > model.first_node[k] and wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
+            wp.atomic_min(control.fault, c, strained + e)
+        if e + 1 < model.first_node[k + 1]:
+            t = state.tangent[e]
+            u = state.tangent[e + 1]
+            if real(1.0) + wp.dot(t, u) < smallest_fold:
+                wp.atomic_min(control.fault, c, folded + e)
+            _sine, cosine = twist(t, u, state.director[e], state.director[e + 1])
+            if cosine < least_cosine:
+                wp.atomic_min(control.fault, c, twisted + e)
+
+    @wp.func(module=module)
+    def distance(p1: vec3, d1: vec3, p2: vec3, d2: vec3):
+        """Distance of segments p1 + s d1 and p2 + t d2 [um]."""
+        st = closest_parameters(p1, d1, p2, d2)
+        return wp.length(p1 + st[0] * d1 - p2 - st[1] * d2)
+
+    @wp.func(module=module)
+    def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
+        """Whether two segments pass through each other while their ends move linearly to the new places."""
+        zero, one = real(0.0), real(1.0)
+        # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign
+        # before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
+        a, b, r = q1 - p1, q2 - p2, p2 - p1
+        da, db, dr = q1n - p1n - a, q2n - p2n - b, p2n - p1n - r
+        mixed = wp.cross(a, db) + wp.cross(da, b)
+        c0 = wp.dot(wp.cross(a, b), r)
+        c1 = wp.dot(mixed, r) + wp.dot(wp.cross(a, b), dr)
+        c2 = wp.dot(wp.cross(da, db), r) + wp.dot(mixed, dr)
+        c3 = wp.dot(wp.cross(da, db), dr)
+        first, second = one, one
+        discriminant = c2 * c2 - real(3.0) * c3 * c1
+        if discriminant > zero:
+            root = wp.where(c2 < zero, wp.sqrt(discriminant) - c2, -wp.sqrt(discriminant) - c2)
+            if root != zero:
+                first = wp.clamp(c1 / root, zero, one)
+                if c3 != zero:
+                    second = wp.clamp(root / (real(3.0) * c3), zero, one)
+        begin = zero
+        for bracket in range(3):
+            end = one
+            if bracket == 0:
+                end = wp.min(first, second)
+            elif bracket == 1:
+                end = wp.max(first, second)
+            low, high = begin, end
+            before = c0 + low * (c1 + low * (c2 + low * c3))
+            after = c0 + high * (c1 + high * (c2 + high * c3))
+            if (before > zero) != (after > zero):
+                for _step in range(24):
+                    x = real(0.5) * (low + high)
+                    v = c0 + x * (c1 + x * (c2 + x * c3))
+                    if (v > zero) == (before > zero):
+                        low = x
+                    else:
+                        high = x
+                x = real(0.5) * (low + high)
+                if distance(p1 + x * (p1n - p1), a + x * da, p2 + x * (p2n - p2), b + x * db) < touch:
+                    return True
+            begin = end
+        return False
+
+    @wp.func(module=module)
+    def met(state: State, guard: Guard, e: wp.int32, j: wp.int32, moved: real, touch: real):
+        """Whether segments e and j have passed through each other since the last look; no node has moved further."""
+        away = middle(state, e) - middle(state, j)
+        half = real(0.5) * state.length[j]
+        within = real(0.5) * state.length[e] + half + touch
+        reach = within + real(2.0) * moved
+        if not (wp.dot(away, away) < reach * reach):
+            return False
+        # No point of one has moved further against a point of the other than their ends have.
+        p1n, q1n, p2n, q2n = state.position[e - 1], state.position[e], state.position[j - 1], state.position[j]
+        p1, q1, p2, q2 = guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j]
+        dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
+        parted = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
+        parted = wp.sqrt(wp.max(parted, wp.max(wp.length_sq(dp1 - dq2), wp.length_sq(dq1 - dp2))))
+        reach = within + parted
+        return (
+            wp.dot(away, away) < reach * reach
+            and not beside(away, state.tangent[e], state.tangent[j], half, touch + parted)
+            and distance(p1n, q1n - p1n, p2n, q2n - p2n) < touch + parted
+            and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch)
+        )
+
+    @wp.func(module=module)
+    def farthest(model: Model, ways: wp.array(dtype=real), c: wp.int32):
+        """The longest of these ways of the flagella of cell c."""
+        longest = real(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            longest = wp.max(longest, ways[k])
+            k += 1
+        return longest
+
+    @wp.kernel(module=module)
+    def check_crossings(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        guard: Guard,
+        near: Neighbours,
+        listed: Contacts,
+        # Out:
+        control: Control,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0 or chart.commit[c] == 0 or not due(control, guard, chart, c):
+            return  # a start has no earlier place to come from
+        k = model.flagellum_of[e]
+        if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
+            return
+        touch = real(0.05) * model.steric_diameter[c]
+        moved = farthest(model, guard.moved, c)
+        # What can have met between the two looks is listed, if nothing has been far from where it was looked for: as a
+        # contact, or as a neighbour.
+        as_contact = bool(False)
+        if wp.static(listing):
+            strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
+            as_contact = strayed < listed_reach * model.steric_diameter[c]
+        shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
+        if as_contact or shifted < contact_reach * model.steric_diameter[c] + skin:
+            i = first_later(model, near, e)
+            stop = candidates(model, near, e)
+            if as_contact:
+                i = listed.start[e]
+                stop = listed.stop[e]
+            while i < stop:
+                j = int(-1)
+                if as_contact:
+                    j = listed.other[i]
+                if not as_contact:
+                    j = candidate(model, near, e, i)
+                if j >= 0 and met(state, guard, e, j, moved, touch):
+                    wp.atomic_min(control.fault, c, crossing + e)
+                i += 1
+            return
+        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
+        other = k + 1
+        while other < model.first_flagellum[c + 1]:
+            j = model.first_node[other] + 1
+            end = model.first_node[other + 1]
+            while j < end:
+                if met(state, guard, e, j, moved, touch):
+                    wp.atomic_min(control.fault, c, crossing + e)
+                distance = wp.length(middle(state, e) - middle(state, j))
+                j = next_near(guard.longest[other], j, distance, reach)
+            other += 1
+
+    @wp.kernel(module=module)
+    def measure_moves(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        near: Neighbours,
+        listed: Contacts,
+        # Out:
+        guard: Guard,
+    ):
+        k = wp.tid()
+        e = model.first_node[k]
+        if state.active[model.cell_of[e]] == 0:
+            return
+        moved = real(0.0)
+        shifted = real(0.0)
+        longest = real(0.0)
+        strayed = real(0.0)
+        while e < model.first_node[k + 1]:
+            if e > model.first_node[k]:
+                longest = wp.max(longest, state.length[e])
+            moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
+            shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
+            shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
+            if wp.static(listing):
+                strayed = wp.max(strayed, wp.length(state.position[e] - listed.position[e]))
+                strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
+            e += 1
+        guard.longest[k] = longest
+        guard.moved[k] = moved
+        guard.shifted[k] = shifted
+        if wp.static(listing):
+            guard.strayed[k] = strayed
+
+    @wp.kernel(module=module)
+    def remember(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        control: Control,
+        chart: Chart,
+        # Out:
+        guard: Guard,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0 and due(control, guard, chart, c):
+            guard.position[e] = state.position[e]
+
+    return SimpleNamespace(
+        check_elements=check_elements, check_crossings=check_crossings, measure_moves=measure_moves, remember=remember
+    )
+
+
+def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None) -> None:
+    """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
+    `fault`.
+
+    Args:
+        listed: contacts that have been looked for between the last look and this one, if any.
+    """
+    p, listing = model.precision, listed is not None
+    kernels = _kernels(p, listing)
+    inputs = [model.data, state.data, chart, guard, control]
+    wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
+    if model.switches.steric:
+        found = listed if listing else contact_list.struct(p)()
+        moves = [model.data, state.data, state.neighbours, found, guard]
+        wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
+        inputs = [model.data, state.data, chart, guard, state.neighbours, found, control]
+        wp.launch(kernels.check_crossings, model.element_count, inputs=inputs, device=model.device)
+
+
+def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
+    """Keeps the checked pose: the next check looks for crossings since then."""
+    if model.switches.steric:
+        inputs = [model.data, state.data, control, chart, guard]
+        kernel = _kernels(model.precision, False).remember
+        wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

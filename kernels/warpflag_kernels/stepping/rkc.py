@@ -1,0 +1,393 @@
+"""Stabilised explicit stepping: Runge-Kutta-Chebyshev of second order (RKC2), and Euler as its one-stage form.
+
+Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increments since the start of the step:
+
+    Y_1 = m_1 dt F_0,     Y_j = mu_j Y_(j-1) + nu_j Y_(j-2) + m_j dt F_(j-1) + g_j dt F_0,     s stages.
+
+Every cell runs its own small state machine, one right-hand side per pass, so cells of a batch need not agree on
+step or stage count. Its `stage` says what this pass evaluates:
+
+    -1       the state itself, after a start or a change from outside
+     0       a probe next to it: one step of the power method for the spectral radius, which sets the stage count
+     1..s    Y_j; the last one is the new state, and its right-hand side is the F_0 of the next step
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.clock import NO_FAULT, STEP_TOLERANCE, Control
+from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.rod import comoving_chart as chart_stage
+from warpflag_kernels.rod.comoving_chart import vec6d
+from warpflag_kernels.stepping import step_control
+from warpflag_kernels.stepping.step_control import StepControl
+
+DAMPING = 2.0 / 13.0
+# Norm of the probe: spins in rad, displacements in segment lengths.
+PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
+EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}
+# The power method approaches the spectral radius from below; the margin also covers its growth within a step.
+SAFETY = 1.15
+FIRST_PROBES = 40
+NOISE = 20.0  # times the usual round-off of an error estimate, above which there is certainly more in it
+# A state this stiff is past saving: the step is taken, unstable, and the guards stop the cell.
+MOST_STAGES = 1.0e4
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Rkc`: earlier stages and the clockwork of every cell."""
+    real, vec4 = p.real, p.vec4
+
+    @wp.struct
+    class Rkc:
+        previous: wp.array(dtype=vec4)  # [E], Y_(j-1)
+        before_previous: wp.array(dtype=vec4)  # [E], Y_(j-2)
+        start_rate: wp.array(dtype=vec4)  # [E], F_0
+        probe: wp.array(dtype=vec4)  # [E], direction of the power method, any length
+        body_previous: wp.array(dtype=vec6d)  # [C]
+        body_before_previous: wp.array(dtype=vec6d)  # [C]
+        body_start_rate: wp.array(dtype=vec6d)  # [C]
+        stage: wp.array(dtype=wp.int32)  # [C]
+        stages: wp.array(dtype=wp.int32)  # [C], s; fixed to 1 for Euler
+        probes_left: wp.array(dtype=wp.int32)  # [C], before the next step starts
+        probe_norm: wp.array(dtype=wp.float64)  # [C]
+        probe_sum: wp.array(dtype=wp.float64)  # [K], squared norm of the flagellum's part
+        error: wp.array(dtype=real)  # [K], largest node error estimate [um]
+        noise: wp.array(dtype=real)  # [K], below which it is lost in round-off [um]
+        spectral_radius: wp.array(dtype=wp.float64)  # [C] [1/s]
+        coefficients: wp.array(dtype=wp.vec4d)  # [C]: mu, nu, and m dt, g dt [s]
+        evaluations: wp.array(dtype=wp.int32)  # [C], right-hand sides so far
+
+    return Rkc
+
+
+@functools.cache
+def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
+    real, vec4 = p.real, p.vec4
+    Model, State = structs(p).Model, structs(p).State
+    Chart, Rkc = chart_stage.struct(p), struct(p)
+    f = step_control.functions(p, independent=False)
+    accept, next_step, smallest = f.accept, f.next_step, f.smallest
+    module = p.module("euler" if euler else "rkc")
+    damping = wp.constant(wp.float64(DAMPING))
+    probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
+    safety = wp.constant(wp.float64(SAFETY))
+    stage_factor = wp.constant(wp.float64(1.54))
+    epsilon = wp.constant(real(EPSILON[p.name]))
+    most_stages = wp.constant(wp.float64(MOST_STAGES))
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+    no_fault = wp.constant(wp.int32(NO_FAULT))
+
+    @wp.func(module=module)
+    def chebyshev(j: wp.int32, theta: wp.float64):
+        """T_j, T_j', T_j'' at cosh(theta)."""
+        n = wp.float64(j)
+        sh = wp.sinh(theta)
+        value = wp.cosh(n * theta)
+        slope = n * wp.sinh(n * theta) / sh
+        return wp.vec3d(value, slope, (n * n * value - wp.cosh(theta) * slope) / (sh * sh))
+
+    @wp.func(module=module)
+    def weight(j: wp.int32, theta: wp.float64):
+        """b_j; b_0 = b_1 = b_2."""
+        c = chebyshev(wp.max(j, 2), theta)
+        return c[2] / (c[1] * c[1])
+
+    @wp.kernel(module=module)
+    def schedule(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        control: Control,
+        steps: StepControl,
+        rkc: Rkc,
+        # Out:
+        chart: Chart,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        zero = wp.float64(0.0)
+        one = wp.float64(1.0)
+        j = rkc.stage[c]
+        if j == 1:
+            left = control.target[c] - control.time[c]
+            if steps.tolerance[c] > zero:
+                control.step[c] = next_step(steps, c, control.longest_step[c], left)
+            else:
+                count = wp.max(wp.ceil(left / control.longest_step[c] - tolerance), one)
+                control.step[c] = left / count
+            if wp.static(euler):
+                rkc.stages[c] = 1
+            else:
+                stiffness = safety * rkc.spectral_radius[c] * control.step[c]
+                wanted = wp.min(wp.sqrt(one + stage_factor * stiffness), most_stages)
+                rkc.stages[c] = 1 + wp.max(wp.int32(wanted), 1)
+        s = rkc.stages[c]
+        dt = control.step[c]
+        chart.commit[c] = wp.where(j == s, 1, 0)
+        chart.rest[c] = wp.where(j == s or j == -1, 1, 0)
+        if j == s or j == -1:
+            control.at_rest[0] = 1
+        if j <= 0:
+            chart.elapsed[c] = zero
+            chart.body_increment[c] = vec6d(zero)
+            return
+        mu = zero
+        nu = zero
+        m = one
+        g = zero
+        node = one  # stage time over dt
+        if s > 1:
+            w0 = one + damping / wp.float64(s * s)
+            theta = wp.log(w0 + wp.sqrt((w0 - one) * (w0 + one)))
+            last = chebyshev(s, theta)
+            w1 = last[1] / last[2]
+            b = weight(j, theta)
+            if j == 1:
+                m = b * w1
+                node = w1 / (wp.float64(4.0) * w0 * w0)
+            else:
+                b1 = weight(j - 1, theta)
+                b2 = weight(j - 2, theta)
+                here = chebyshev(j, theta)
+                mu = wp.float64(2.0) * b * w0 / b1
+                nu = -b / b2
+                m = wp.float64(2.0) * b * w1 / b1
+                g = -(one - b1 * chebyshev(j - 1, theta)[0]) * m
+                node = w1 * here[2] / here[1]
+        rkc.coefficients[c] = wp.vec4d(mu, nu, m * dt, g * dt)
+        chart.elapsed[c] = node * dt
+        if j == 1:
+            rkc.body_previous[c] = vec6d(zero)
+            rkc.body_before_previous[c] = vec6d(zero)
+        previous = rkc.body_previous[c]
+        rate = chart.body_rate[c]
+        if j == 1:
+            rate = rkc.body_start_rate[c]
+        y = mu * previous + nu * rkc.body_before_previous[c] + (m * dt) * rate + (g * dt) * rkc.body_start_rate[c]
+        rkc.body_before_previous[c] = previous
+        rkc.body_previous[c] = y
+        chart.body_increment[c] = y
+
+    @wp.kernel(module=module)
+    def combine(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        rkc: Rkc,
+        # Out:
+        chart: Chart,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        j = rkc.stage[c]
+        if j == -1:
+            chart.increment[e] = vec4(real(0.0))
+            return
+        if j == 0:
+            chart.increment[e] = real(probe_size / rkc.probe_norm[c]) * rkc.probe[e]
+            return
+        a = rkc.coefficients[c]
+        if j == 1:
+            first = real(a[2]) * rkc.start_rate[e]
+            rkc.before_previous[e] = vec4(real(0.0))
+            rkc.previous[e] = first
+            chart.increment[e] = first
+            return
+        previous = rkc.previous[e]
+        y = (
+            real(a[0]) * previous
+            + real(a[1]) * rkc.before_previous[e]
+            + real(a[2]) * chart.rate[e]
+            + real(a[3]) * rkc.start_rate[e]
+        )
+        rkc.before_previous[e] = previous
+        rkc.previous[e] = y
+        chart.increment[e] = y
+
+    @wp.kernel(module=module)
+    def estimate_error(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        control: Control,
+        chart: Chart,
+        # Out:
+        rkc: Rkc,
+    ):
+        k = wp.tid()
+        e = model.first_node[k]
+        c = model.cell_of[e]
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        # The embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step; a tenth of it,
+        # since it exceeds the errors found in runs ten to fifty times.
+        dt = real(control.step[c])
+        last = model.first_node[k + 1] - 1
+        worst = real(0.0)
+        while e <= last:
+            d = real(0.04) * dt * (rkc.start_rate[e] + chart.rate[e]) - real(0.08) * chart.increment[e]
+            worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+            e += 1
+        # Rates carry the round-off of positions times the stiffness of the stretch: below NOISE times the usual an
+        # estimate means nothing.
+        reach = real(last - model.first_node[k]) * model.segment_length[k]
+        force = epsilon * reach * model.stretching_stiffness[k] / model.segment_length[k]
+        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.mobility_along[last] * force
+        rkc.error[k] = worst
+
+    @wp.kernel(module=module)
+    def decide(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        rkc: Rkc,
+        # Out:
+        control: Control,
+        steps: StepControl,
+        chart: Chart,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        error = wp.float64(0.0)
+        noise = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            error = wp.max(error, wp.float64(rkc.error[k]))
+            noise = wp.max(noise, wp.float64(rkc.noise[k]))
+            k += 1
+        sound = control.fault[c] == no_fault and wp.isfinite(error)
+        if not accept(steps, c, control.step[c], error, noise, sound, True) and control.step[c] > smallest:
+            control.fault[c] = no_fault
+            chart.commit[c] = 0
+            chart.rest[c] = 0
+
+    @wp.kernel(module=module)
+    def keep(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        # Out:
+        rkc: Rkc,
+    ):
+        k = wp.tid()
+        begin = model.first_node[k]
+        end = model.first_node[k + 1]
+        c = model.cell_of[begin]
+        if state.active[c] == 0:
+            return
+        e = begin
+        if chart.rest[c] != 0:
+            while e < end:
+                rkc.start_rate[e] = chart.rate[e]
+                e += 1
+        elif rkc.stage[c] == 0:
+            scale = real(1.0) / model.segment_length[k]
+            total = wp.float64(0.0)
+            while e < end:
+                d = chart.rate[e] - rkc.start_rate[e]
+                rkc.probe[e] = d
+                x = scale * scale * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+                total += wp.float64(x + d[3] * d[3])
+                e += 1
+            rkc.probe_sum[k] = total
+
+    @wp.kernel(module=module)
+    def turn_over(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        # Out:
+        control: Control,
+        rkc: Rkc,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        rkc.evaluations[c] += 1
+        j = rkc.stage[c]
+        if chart.rest[c] != 0:
+            rkc.body_start_rate[c] = chart.body_rate[c]
+            t = control.time[c]
+            if chart.commit[c] != 0:
+                control.steps[c] += 1
+                t += control.step[c]
+                # Steps divide what is left evenly, so the last one ends on the target itself.
+                if control.target[c] - t < tolerance * control.step[c]:
+                    t = control.target[c]
+                control.time[c] = t
+            if t >= control.target[c] or control.fault[c] != no_fault:
+                state.active[c] = 0
+                wp.atomic_sub(control.unfinished, 0, 1)
+            rkc.stage[c] = wp.static(1 if euler else 0)
+        elif j == 0:
+            total = wp.float64(0.0)
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                total += rkc.probe_sum[k]
+                k += 1
+            norm = wp.sqrt(total)
+            rkc.probe_norm[c] = norm
+            rkc.spectral_radius[c] = norm / probe_size
+            rkc.probes_left[c] -= 1
+            if rkc.probes_left[c] <= 0:
+                rkc.probes_left[c] = 1
+                rkc.stage[c] = 1
+        elif j == rkc.stages[c]:
+            rkc.stage[c] = 1  # refused: again, shorter, from the same F_0
+        else:
+            rkc.stage[c] = j + 1
+
+    return SimpleNamespace(
+        schedule=schedule,
+        combine=combine,
+        estimate_error=estimate_error,
+        decide=decide,
+        keep=keep,
+        turn_over=turn_over,
+    )
+
+
+def begin_pass(
+    model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any, euler: bool
+) -> None:
+    """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
+    kernels = _kernels(model.precision, euler)
+    inputs = [model.data, state.data, control, steps, rkc, chart]
+    wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
+    inputs = [model.data, state.data, rkc, chart]
+    wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
+
+
+def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
+    """Estimates the error of every completed step and takes back `commit` where the step is refused."""
+    kernels = _kernels(model.precision, False)
+    inputs = [model.data, state.data, control, chart, rkc]
+    wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
+    inputs = [model.data, state.data, rkc, control, steps, chart]
+    wp.launch(kernels.decide, model.cell_count, inputs=inputs, device=model.device)
+
+
+def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
+    """Keeps what later stages need and moves every cell's clockwork on."""
+    kernels = _kernels(model.precision, euler)
+    inputs = [model.data, state.data, chart, rkc]
+    wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
+    inputs = [model.data, state.data, chart, control, rkc]
+    wp.launch(kernels.turn_over, model.cell_count, inputs=inputs, device=model.device)

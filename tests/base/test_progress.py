@@ -1,0 +1,108 @@
+"""The progress line, on a stream and a clock made for the test."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+
+import pytest
+
+from warpflag.base.progress import Progress
+
+
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self):
+        return self.now
+
+
+def run(stream, clock, *, total=0.015, start=0.0, updates=150, seconds_per_update=0.06, quiet=False):
+    """A run that takes 9 s for 15 ms: 600 ms per ms."""
+    progress = Progress(total, stream, quiet, clock)
+    progress.update(start)
+    for i in range(1, updates + 1):
+        clock.now += seconds_per_update
+        progress.update(start + (0.015 - start) * i / 150)
+    return progress
+
+
+def test_a_file_gets_a_line_a_second():
+    stream = io.StringIO()
+    run(stream, Clock()).close()
+    lines = stream.getvalue().splitlines()
+    assert 8 <= len(lines) <= 10
+    assert "\r" not in stream.getvalue()
+    assert "100 %" in lines[-1] and "15.00 / 15.00 ms" in lines[-1] and "left" not in lines[-1]
+
+
+def test_speed_and_time_left():
+    stream, clock = io.StringIO(), Clock()
+    run(stream, clock, updates=51)
+    line = stream.getvalue().splitlines()[-1]
+    assert "34 %" in line and "5.10 / 15.00 ms" in line and "600 ms per ms" in line and "6 s left" in line
+
+
+def test_first_moments_tell_nothing_of_the_rate():
+    stream, clock = Screen(), Clock()
+    progress = Progress(0.015, stream, clock=clock)
+    progress.update(0.0)
+    for seconds, time in ((1.0, 1e-5), (1.5, 1e-4)):  # under two seconds and one per cent: no word yet
+        clock.now = Clock.now + seconds
+        progress.update(time)
+        assert "per ms" not in stream.getvalue() and "left" not in stream.getvalue()
+    clock.now = Clock.now + 2.5
+    progress.update(1.2e-4)
+    assert "per ms" in stream.getvalue() and "left" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds_per_update", "expected"), [(2.0, "3:20 min left"), (60.0, "1:40 h left"), (0.001, "10.0 ms per ms")]
+)
+def test_time_left_reads_well(seconds_per_update, expected):
+    stream = io.StringIO()
+    run(stream, Clock(), updates=50, seconds_per_update=seconds_per_update).close()
+    assert expected in stream.getvalue().splitlines()[-1]
+
+
+def test_a_terminal_gets_one_line_redrawn():
+    stream = Screen()
+    run(stream, Clock()).close()
+    text = stream.getvalue()
+    assert text.count("\n") == 1 and text.endswith("\n")
+    drawn = text[:-1].split("\r")[1:]
+    assert 60 < len(drawn) < 100  # ten a second at most
+    assert drawn[0].startswith("[................]   0 %")
+    assert drawn[-1].startswith("[################] 100 %")
+    assert max(map(len, drawn)) < 80
+    # What a shorter line leaves of a longer one before it is blanked.
+    assert all(len(after) >= len(before.rstrip()) for before, after in pairwise(drawn))
+
+
+def test_a_resumed_run_counts_its_own_speed():
+    stream = io.StringIO()
+    run(stream, Clock(), start=0.009, updates=75).close()
+    line = stream.getvalue().splitlines()[-1]
+    assert "80 %" in line and "1500 ms per ms" in line and "4 s left" in line  # 3 ms in 4.5 s, 3 ms to go
+
+
+def test_quiet_and_unused_are_silent():
+    for stream in (io.StringIO(), Screen()):
+        run(stream, Clock(), quiet=True).close()
+        Progress(1.0, stream).close()
+        assert stream.getvalue() == ""
+
+
+def test_closing_early_shows_where_it_stopped():
+    stream = io.StringIO()
+    progress = run(stream, Clock(), updates=10)
+    assert stream.getvalue() == ""
+    progress.close()
+    progress.close()
+    assert stream.getvalue().splitlines()[0].startswith("  7 %  1.00 / 15.00 ms")
+    assert stream.getvalue().count("\n") == 1

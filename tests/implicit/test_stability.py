@@ -1,0 +1,64 @@
+"""How strongly flows outside the matrix act, as it is measured: against the eigenvalues of dense matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from warpflag_kernels.implicit import frozen_flow, stability
+
+from tests.bench import Bench, bench, dense_solver
+from tests.helpers import shaken, touching_cell
+
+# Of kappa, relative.
+TOLERANCE = {"float64": 1e-3, "float32": 5e-3}
+STEP, GAIN, WEIGHT = 1e-5, 0.6, 1.5  # s, g, over-implicitness
+FREE = {"steric.enabled": False, "body.contact": False, "flagella.length": 1.0, "flagella.count": 3}
+BESIDE = {**FREE, "flagellum.2.azimuth": 353.0}
+
+
+def crowd(name: str, precision: str, device: str) -> Bench:
+    """Three flagella, far from each other or side by side."""
+    if name == "apart":
+        return bench({**FREE, "flagellum.1.length": 0.8}, precision, device)
+    scene = touching_cell({**BESIDE, "body.anchored": name == "anchored"}, precision, 0.055)
+    return Bench(scene, shaken(scene, 1, node=1e-3, spin=0.05), device)
+
+
+def looked(b: Bench, times: int) -> tuple[float, float]:
+    """kappa and the over-implicitness chosen, after so many looks at one state."""
+    s = b.stepper
+    b.factorise(STEP, WEIGHT * GAIN)
+    s._law.gain.fill_(GAIN)
+    frozen_flow.build(b.model, b.state, s._flow)
+    for _ in range(times):
+        s.data.over_implicit.fill_(WEIGHT)
+        s.stability.look.fill_(1)
+        s.stability.active.fill_(1)
+        s._measure_stability()
+    return float(s.stability.kappa.numpy()[0]), float(s.data.over_implicit.numpy()[0])
+
+
+@pytest.mark.parametrize("name", ["apart", "side by side", "anchored"])
+def test_kappa_is_the_largest_eigenvalue_with_the_full_mobility(name, device, precision):
+    exact, b = (crowd(name, p, device) for p in ("float64", precision))
+    exact.factorise(STEP, WEIGHT * GAIN)
+    full = np.eye(6 + 4 * b.count) / STEP + GAIN * exact.mobility() @ exact.hessian()
+    eigenvalues = np.abs(np.linalg.eigvals(WEIGHT * dense_solver(exact, STEP, WEIGHT * GAIN) @ full))
+    found, chosen = looked(b, 400)
+    assert found == pytest.approx(eigenvalues.max(), rel=TOLERANCE[precision])
+    assert chosen == pytest.approx(max(stability.SHARE * found, stability.FALL * WEIGHT, stability.LEAST), rel=1e-6)
+
+
+def test_who_looks_and_when(device, precision):
+    """A cell of three flagella, at its start, every few steps, and after a step that was refused; one of two, never."""
+    b = bench(FREE, precision, device)
+    s = b.stepper
+    first, later = stability.FIRST_LOOKS, 100 * stability.INTERVAL
+    for steps, accepted, expected in (
+        (first - 1, 1, True), (later, 1, True), (later + 1, 1, False), (later + 1, 0, True),
+    ):  # fmt: skip
+        s.data.evaluations.fill_(steps)
+        s.data.accepted.fill_(accepted)
+        stability.schedule(b.model, b.state, s.data.evaluations, s.data.accepted, s.stability)
+        assert bool(s.stability.look.numpy()[0]) == expected
+    assert bench({}, precision, device).stepper.stability is None

@@ -1,0 +1,264 @@
+"""Initial shapes: exact ground states, where they sit on the body, and the phase they start with."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warpflag.model.geometry import ground_state, initial_state, phase_difference_at
+from warpflag.observables import phase_difference, turns_about_axis
+from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, load, with_values
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
+NORMAL = (0.0, 1.3, -2.1)
+STRAINS = [NORMAL, (0.0, 1.3, 2.1), (0.7, -1.1, 1.9), (2.0, 0.0, -0.3), (1.0, 1.0, 0.0), (0.0, 0.0, 2.0), (0.0,) * 3]
+
+
+def paper_scene(opening_angle: float = 90.0, **flagella) -> Scene:
+    return Scene("test", flagella=Flagella(opening_angle=opening_angle, **flagella))
+
+
+def tangents(nodes: np.ndarray) -> np.ndarray:
+    edges = np.diff(nodes, axis=0)
+    return edges / np.linalg.norm(edges, axis=1, keepdims=True)
+
+
+def joint_strains(t: np.ndarray, e1: np.ndarray) -> np.ndarray:
+    """(h Omega_1, h Omega_2, h Omega_3) of every joint, written down from the definitions."""
+    strains = []
+    for t_e, t_f, e1_e, e1_f in zip(t[:-1], t[1:], e1[:-1], e1[1:], strict=True):
+        kb = 2 * np.cross(t_e, t_f) / (1 + t_e @ t_f)
+        e2_e, e2_f = np.cross(t_e, e1_e), np.cross(t_f, e1_f)
+        # Parallel transport of e1_e from t_e onto t_f: Rodrigues' formula with sin b = t_e x t_f.
+        axis = np.cross(t_e, t_f)
+        carried = e1_e * (t_e @ t_f) + np.cross(axis, e1_e) + axis * (axis @ e1_e) / (1 + t_e @ t_f)
+        twist = math.atan2(np.cross(carried, e1_f) @ t_f, carried @ e1_f)
+        strains.append([kb @ (e1_e + e1_f) / 2, kb @ (e2_e + e2_f) / 2, twist])
+    return np.array(strains)
+
+
+@pytest.mark.parametrize(
+    ("segment_length", "radius", "pitch", "rise"),
+    [(0.2, 0.2194, 2.1397, 0.16864), (0.1, 0.2147, 2.1573, None)],
+)
+def test_ground_state_has_the_known_sizes(segment_length, radius, pitch, rise):
+    helix = ground_state(NORMAL, segment_length)
+    assert helix.radius == pytest.approx(radius, abs=5e-5)
+    assert helix.pitch == pytest.approx(pitch, abs=5e-5)
+    if rise is not None:
+        assert helix.rise == pytest.approx(rise, abs=5e-6)
+
+
+def test_ground_state_converges_to_the_continuum_helix_at_second_order():
+    curvature, torsion = NORMAL[1], -NORMAL[2]
+    squared = curvature**2 + torsion**2
+    exact = np.array([curvature / squared, 2 * math.pi * torsion / squared])
+    assert exact == pytest.approx([0.2131, 2.163], abs=5e-4)
+    helices = [ground_state(NORMAL, h) for h in (0.2, 0.1, 0.05, 0.025)]
+    errors = np.array([[helix.radius, helix.pitch] - exact for helix in helices])
+    orders = np.log2(errors[:-1] / errors[1:])
+    np.testing.assert_allclose(orders, 2.0, atol=0.06)
+    np.testing.assert_allclose(orders[-1], 2.0, atol=0.004)
+
+
+@pytest.mark.parametrize("strain", STRAINS)
+@pytest.mark.parametrize("segment_length", [0.05, 0.2, 1.0])
+def test_every_joint_has_exactly_the_intrinsic_strain(strain, segment_length):
+    scene = paper_scene(intrinsic_curvature=strain, segment_length=segment_length, length=6.0)
+    state = initial_state(scene)
+    for nodes, e1 in zip(state.positions, state.directors, strict=True):
+        lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+        np.testing.assert_allclose(lengths, segment_length, rtol=0, atol=1e-14)
+        strains = joint_strains(tangents(nodes), e1[1:])
+        # Tangents are differences of nodes up to 7 um from the origin: 8 eps / h.
+        np.testing.assert_allclose(
+            strains, segment_length * np.array([strain] * len(strains)), rtol=0, atol=max(1e-14, 2e-15 / segment_length)
+        )
+
+
+def test_joint_rotation_has_the_strain_to_rounding():
+    for strain, h in itertools.product(STRAINS, (0.02, 0.2, 1.0)):
+        joint = ground_state(strain, h).joint
+        np.testing.assert_allclose(joint.T @ joint, np.eye(3), rtol=0, atol=1e-15)
+        strains = joint_strains(np.array([[0.0, 0.0, 1.0], joint[:, 2]]), np.array([[1.0, 0.0, 0.0], joint[:, 0]]))
+        np.testing.assert_allclose(strains[0], h * np.array(strain), rtol=0, atol=1e-15)
+
+
+def test_a_twist_of_pi_per_joint_is_refused():
+    with pytest.raises(ValueError, match="below pi"):
+        ground_state((0.0, 1.0, math.pi), 1.0)
+
+
+@pytest.mark.parametrize(("third", "sign"), [(-2.1, -1.0), (2.1, 1.0)])
+def test_handedness(third, sign):
+    scene = paper_scene(intrinsic_curvature=(0.0, 1.3, third))
+    axis = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
+    nodes = initial_state(scene).positions[0]
+    helix = ground_state((0.0, 1.3, third), 0.2)
+    assert math.copysign(1.0, helix.angle) == sign
+    centre = nodes[0] + helix.radius * np.array([math.sqrt(0.5), 0.0, -math.sqrt(0.5)])
+    assert turns_about_axis(nodes, centre, axis) == pytest.approx(30 * helix.angle / (2 * math.pi), abs=1e-12)
+    t = tangents(nodes)
+    assert sign * np.cross(t[0], t[1]) @ t[2] > 0
+
+
+@pytest.mark.parametrize("phase", [0.0, 37.0, 180.0, 290.0])
+@pytest.mark.parametrize(("azimuth", "tilt"), [(0.0, 45.0), (180.0, 11.5), (72.0, 60.0), (0.0, 0.0), (45.0, 140.0)])
+def test_helix_lies_about_the_axis_asked_for_at_the_phase_asked_for(azimuth, tilt, phase):
+    own = FlagellumOverride(azimuth=azimuth, tilt=tilt, phase=phase, anchor_offset=-0.3)
+    scene = Scene("test", flagella=Flagella(count=1), flagellum=(own,))
+    nodes = initial_state(scene).positions[0]
+    helix = ground_state(NORMAL, 0.2)
+    normal = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth)), 0.0])
+    axis = math.cos(math.radians(tilt)) * np.array([0, 0, 1.0]) + math.sin(math.radians(tilt)) * normal
+    np.testing.assert_allclose(nodes[0], 0.4 * normal + [0, 0, -0.3], atol=1e-15)
+    np.testing.assert_allclose(np.diff(nodes, axis=0) @ axis, helix.rise, rtol=0, atol=3e-15)
+    x = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+    x /= np.linalg.norm(x)
+    outward = math.cos(math.radians(phase)) * x + math.sin(math.radians(phase)) * np.cross(axis, x)
+    offsets = nodes - (nodes[0] - helix.radius * outward)
+    across = offsets - np.outer(offsets @ axis, axis)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=1), helix.radius, rtol=0, atol=1e-14)
+
+
+def test_phase_of_an_axis_along_x_is_the_limit_of_tilted_axes():
+    nodes = [initial_state(paper_scene(opening_angle)).positions for opening_angle in (180.0, 180.0 - 1e-6)]
+    for exact, near in zip(*nodes, strict=True):
+        np.testing.assert_allclose(exact, near, atol=1e-6)
+
+
+def test_straight_rods_lie_along_their_axis_and_their_phase_turns_the_frame():
+    def flagellum(phase):
+        own = FlagellumOverride(tilt=30.0, phase=phase)
+        scene = Scene("test", flagella=Flagella(count=1, intrinsic_curvature=(0, 0, 0)), flagellum=(own,))
+        state = initial_state(scene)
+        return state.positions[0], state.directors[0]
+
+    nodes, e1 = flagellum(0.0)
+    np.testing.assert_allclose(tangents(nodes), np.tile([0.5, 0.0, math.sqrt(0.75)], (30, 1)), atol=1e-14)
+    turned_nodes, turned_e1 = flagellum(90.0)
+    np.testing.assert_allclose(turned_nodes, nodes, atol=1e-15)
+    np.testing.assert_allclose(turned_e1[1:], np.cross([0.5, 0.0, math.sqrt(0.75)], e1[1:]), atol=1e-15)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_examples_start_on_the_body_and_clear_of_contact(path):
+    scene = load(path)
+    state = initial_state(scene)
+    cutoff = 2 ** (1 / 6) * 4 * scene.flagella.filament_radius
+    half = (scene.body.length - scene.body.width) / 2
+    fractions = np.linspace(0.0, 1.0, 25, endpoint=False)[None, :, None]
+    curves = []
+    for nodes in state.positions:
+        axial = np.clip(nodes[:, 2], -half, half)
+        gap = np.linalg.norm(nodes - axial[:, None] * [0, 0, 1], axis=1) - scene.body.width / 2
+        assert abs(gap[0]) < 1e-15
+        assert gap[1:].min() > 1.3 * cutoff
+        curves.append((nodes[:-1, None] * (1 - fractions) + nodes[1:, None] * fractions).reshape(-1, 3))
+    for a, b in itertools.combinations(curves, 2):
+        assert np.linalg.norm(a[:, None] - b[None], axis=-1).min() > 4 * cutoff
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+def test_tripod_stands_on_the_motor_axis_without_twist(path):
+    scene = load(path)
+    state = initial_state(scene)
+    for spec, nodes, e1 in zip(scene.resolved_flagella(), state.positions, state.directors, strict=True):
+        assert nodes.shape == e1.shape == (spec.segment_count + 1, 3)
+        around, angle = math.radians(spec.azimuth), math.radians(spec.motor_axis_angle)
+        normal = np.array([math.cos(around), math.sin(around), 0.0])
+        motor_axis = math.cos(angle) * np.array([0, 0, 1.0]) + math.sin(angle) * normal
+        assert abs(e1[0] @ motor_axis) < 1e-15
+        np.testing.assert_allclose(np.linalg.norm(e1, axis=1), 1.0, rtol=0, atol=1e-15)
+        assert abs(joint_strains(np.array([motor_axis, tangents(nodes)[0]]), e1[:2])[0, 2]) < 1e-14
+        np.testing.assert_allclose(np.vecdot(tangents(nodes), e1[1:]), 0.0, atol=1e-14)
+    assert state.body_position.tolist() == [0, 0, 0] and state.body_orientation.tolist() == [0, 0, 0, 1]
+
+
+def test_a_motor_axis_against_the_first_segment_is_refused():
+    scene = with_values(paper_scene(0.0, intrinsic_curvature=(0, 0, 0)), {"motor.axis_angle": 180.0})
+    with pytest.raises(SceneError, match=r"motor\.axis_angle = 180\.0: .* flagellum 0"):
+        initial_state(scene)
+
+
+def test_mirrored_flagella_are_the_mirror_image():
+    """Reflection in the x-z plane turns psi and the third strain round and keeps e1."""
+    phases = {"flagellum.0.phase": 50.0, "flagellum.1.phase": 200.0}
+    left = initial_state(with_values(paper_scene(44.0), phases))
+    mirrored_phases = {key: -phase for key, phase in phases.items()}
+    right = initial_state(with_values(paper_scene(44.0, intrinsic_curvature=(0.0, 1.3, 2.1)), mirrored_phases))
+    for original, image in zip(left.positions + left.directors, right.positions + right.directors, strict=True):
+        np.testing.assert_allclose(image, original * [1, -1, 1], atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("opening_angle", "length", "shift", "theta"),
+    [(23, 6, 150, 0.80), (44, 6, 120, 0.60), (90, 6, 130, 0.59), (23, 8, 150, 0.80), (90, 8, 130, 0.61)],
+)
+def test_known_shifts_give_the_known_phase_differences(opening_angle, length, shift, theta):
+    scene = paper_scene(opening_angle, length=length)
+    assert round(phase_difference_at(scene, shift), 2) == theta
+
+
+@pytest.mark.parametrize(("opening_angle", "lowest"), [(23, 0.04), (44, 0.09), (90, 0.20)])
+def test_phase_difference_is_reached_or_refused(opening_angle, lowest):
+    def measured(scene):
+        state = initial_state(scene)
+        first_node = np.cumsum([0] + [len(nodes) for nodes in state.positions])
+        return phase_difference(np.vstack(state.positions), np.vstack(state.directors), first_node)
+
+    for wanted in (lowest + 0.01, 0.3, 0.59, 0.8, 1.0 - 1e-9):
+        scene = paper_scene(opening_angle, phase_difference=wanted)
+        assert measured(scene) == pytest.approx(wanted, abs=1e-10)
+    # Without a wish both start at the same phase angle, where the least phase difference lies.
+    assert measured(paper_scene(opening_angle)) == pytest.approx(lowest, abs=6e-3)
+    with pytest.raises(SceneError, match=r"flagella\.phase_difference = .*: these flagella reach") as caught:
+        initial_state(paper_scene(opening_angle, phase_difference=lowest - 0.01))
+    reach = re.search(r"reach ([\d.]+) to ([\d.]+)", str(caught.value))
+    assert reach and float(reach[1]) == pytest.approx(lowest, abs=6e-3) and float(reach[2]) > 0.999
+    initial_state(paper_scene(opening_angle, phase_difference=1.0))
+
+
+def test_the_main_scene_starts_with_a_shift_of_130_degrees():
+    scene = load(next(path for path in EXAMPLES if path.stem == "zipping"))
+    state = initial_state(scene)
+    shifted = initial_state(
+        with_values(
+            scene,
+            {"flagella.phase_difference": None, "flagellum.0.phase": 180.0, "flagellum.1.phase": 310.0},
+        )
+    )
+    for chosen, expected in zip(state.positions, shifted.positions, strict=True):
+        np.testing.assert_allclose(chosen, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [20.0, 97.0, 175.0])
+def test_phase_difference_turns_flagella_of_odd_number_by_at_most_180_degrees(shift):
+    def own(*phases):
+        azimuths = (0.0, 180.0, 90.0, 270.0)
+        return tuple(FlagellumOverride(azimuth=a, phase=p) for a, p in zip(azimuths, phases, strict=True))
+
+    group = Flagella(count=4, opening_angle=44.0)
+    wanted = phase_difference_at(Scene("test", flagella=group, flagellum=own(None, None, 20.0, None)), shift)
+    wished = dataclasses.replace(group, phase_difference=wanted)
+    chosen = initial_state(Scene("test", flagella=wished, flagellum=own(None, None, 20.0, None)))
+    phases = (180.0, 180.0 + shift, 20.0, 180.0 + shift)
+    expected = initial_state(Scene("test", flagella=group, flagellum=own(*phases)))
+    for found, nodes in zip(chosen.positions, expected.positions, strict=True):
+        np.testing.assert_allclose(found, nodes, atol=1e-9)
+
+
+def test_flagella_of_unequal_length_can_be_shifted():
+    own = (FlagellumOverride(), FlagellumOverride(length=4.0))
+    scene = Scene("test", flagella=Flagella(opening_angle=23.0, phase_difference=0.7), flagellum=own)
+    state = initial_state(scene)
+    assert [len(nodes) for nodes in state.positions] == [31, 21]
+    first_node = np.array([0, 31, 52])
+    theta = phase_difference(np.vstack(state.positions), np.vstack(state.directors), first_node)
+    assert theta == pytest.approx(0.7, abs=1e-10)

@@ -1,0 +1,103 @@
+"""A batch: every member runs as it would alone, with its own clock, and falls alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from warpflag_kernels.stepping.health import Fault
+
+from tests.helpers import cell, touching_cell
+from warpflag.model.geometry import initial_state
+from warpflag.run.simulation import CellState, NumericalError, Simulation
+from warpflag.scene import Scene, SceneError, with_values
+
+STATE = [field.name for field in dataclasses.fields(CellState)]
+
+
+def members(precision: str, stepper: str = "rkc") -> list[Scene]:
+    """Cells that share nothing but their terms: torques, lengths, phases, flagella, fluids, steps."""
+    common = {"numerics.stepper": stepper}
+    return [
+        cell(common, precision),
+        cell({"motor.torque": 1.0, "flagella.phase_difference": 0.4, **common}, precision),
+        touching_cell({"flagella.length": 1.6, "numerics.time_step": 2e-6, **common}, precision),
+        cell({"flagella.count": 3, "fluid.viscosity": 2e-3, "numerics.time_step": 4e-6, **common}, precision),
+        cell(
+            {"flagella.stretching_stiffness": 1e4, "flagellum.1.length": 1.0, "motor.torque": 0.1, **common}, precision
+        ),
+    ]
+
+
+def equal(a: CellState, b: CellState) -> bool:
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in STATE)
+
+
+@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
+def test_members_equal_their_single_runs_to_the_last_bit(stepper, device, precision):
+    scenes = members(precision, stepper)
+    batch = Simulation(scenes, device=device)
+    for until in (2e-5, 3.5e-5):
+        batch.advance(until)
+    for c, scene in enumerate(scenes):
+        alone = Simulation(scene, device=device)
+        for until in (2e-5, 3.5e-5):
+            alone.advance(until)
+        assert equal(batch.cell_state(c), alone.cell_state()), c
+    assert len(set(batch.steps)) > 1  # each took its own number of steps to the same time
+    assert (batch.times == 3.5e-5).all()
+
+
+def test_members_do_not_feel_each_other(device):
+    """Two cells in the same place: no contact, no flow between them."""
+    scene = cell()
+    batch = Simulation([scene, with_values(scene, {"motor.torque": -3.4}), scene], device=device)
+    batch.advance(3e-5)
+    assert equal(batch.cell_state(0), batch.cell_state(2))
+    assert not np.array_equal(batch.cell_state(0).positions, batch.cell_state(1).positions)
+
+
+@pytest.mark.parametrize("stepper", ["rkc", "euler"])
+def test_a_member_that_violates_a_guard_falls_alone(stepper, device):
+    short = {"numerics.stepper": stepper}
+    weak, wild = cell(short), cell({"motor.torque": 60.0, **short})  # twists its joints beyond a quarter turn
+    batch, alone = Simulation([weak, wild, weak], device=device), Simulation(weak, device=device)
+    until = {"rkc": 2e-5, "euler": 4e-6}[stepper]
+    alone.advance(until)
+    with pytest.raises(NumericalError) as caught:
+        batch.advance(until)
+    assert caught.value.cell == 1
+    assert caught.value.flagellum in (0, 1)
+    assert caught.value.time == batch.times[1] < until
+    assert batch.times[0] == batch.times[2] == until
+    assert equal(batch.cell_state(0), alone.cell_state())
+    # The others go on; the fallen one stays where it fell, and is not forgotten.
+    fallen = batch.cell_state(1)
+    alone.advance(2 * until)
+    with pytest.raises(NumericalError) as again:
+        batch.advance(2 * until)
+    assert str(again.value) == str(caught.value)
+    assert batch.times[2] == 2 * until
+    assert equal(batch.cell_state(2), alone.cell_state())
+    assert np.array_equal(batch.cell_state(1).positions, fallen.positions)
+
+
+def test_a_bad_start_in_a_batch_names_its_own_flagellum(device):
+    scenes = [cell({"flagella.count": 3}), cell()]
+    starts = [initial_state(scene) for scene in scenes]
+    nodes = [x.copy() for x in starts[1].positions]
+    nodes[1][4:] += 0.3 * (nodes[1][4] - nodes[1][3])
+    starts[1] = dataclasses.replace(starts[1], positions=tuple(nodes))
+    batch = Simulation(scenes, device=device, starts=starts)
+    with pytest.raises(NumericalError) as caught:
+        batch.advance(1e-5)
+    error = caught.value
+    assert (error.kind, error.cell, error.flagellum, error.segment) == (Fault.STRAIN, 1, 1, 4)
+    assert batch.times[0] == 1e-5
+
+
+def test_a_batch_needs_the_same_terms_and_stepper(device):
+    for other in ({"steric.enabled": False}, {"numerics.stepper": "euler"}, {"flagella.count": 1}):
+        with pytest.raises(SceneError):
+            Simulation([cell(), cell(other)], device=device)

@@ -1,0 +1,89 @@
+"""One run: its directory and what it says of itself."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from tests.runs import arrays, executed, small, summary
+from warpflag import observables
+from warpflag.record import Record
+from warpflag.run import run
+from warpflag.run.simulation import Simulation
+from warpflag.scene import dumps, load
+
+
+def test_a_run_leaves_record_movie_scene_and_summary(tmp_path):
+    scene = small()
+    directory = executed(scene, tmp_path / "made")
+    assert load(directory / "scene.toml") == scene
+    from pxr import Usd
+
+    assert Usd.Stage.Open(str(directory / "movie.usdc")).GetEndTimeCode() == 8
+    said = summary(directory)
+    with Record(directory) as record:
+        np.testing.assert_allclose(record.times, np.arange(9) * 1e-5, rtol=1e-12)
+        assert record.scene_text == dumps(scene)
+        assert said["steps"] == record.steps[-1] >= 8
+        assert said["frames"] == record.frame_count == 9
+        for name, values in record.observables.items():
+            np.testing.assert_array_equal(said["observables"][name], values[-1])
+    assert said["status"] == "done" and said["guards"]["violated"] is None
+    assert (said["device"], said["precision"], said["stepper"]) == ("cpu", "float64", "implicit")
+    assert said["wall_time"] > 0 and said["rejected_steps"] >= 0
+    assert said["evaluations"] == said["steps"] + said["rejected_steps"]  # one a step
+    assert said["versions"].keys() >= {"warpflag", "warp-lang", "python"} and "-march=native" in said["kernel_flags"]
+
+
+def test_rates_are_differences_of_the_recorded_frames(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    with Record(directory) as record:
+        times, measured = record.times, record.observables
+        assert all(np.isnan(measured[name][0]).all() for name in ("body_speed", "body_rate", "motor_rate"))
+        turned = np.diff(record.motor_angle, axis=0) / (2 * np.pi * np.diff(times)[:, None])
+        np.testing.assert_allclose(measured["motor_rate"][1:], turned, rtol=1e-12)
+        for k, (i, j) in enumerate(pairwise(range(9)), 1):
+            pair = record.body_orientation[[i, j]]
+            # Each stepper adds the turns of its steps; over one frame that is the turn between its ends.
+            np.testing.assert_allclose(measured["body_rate"][k], observables.body_rate(times[[i, j]], pair), rtol=1e-3)
+        window = summary(directory)["rates"]
+        assert (window["from"], window["to"]) == (times[6], times[8])
+        np.testing.assert_allclose(window["motor_rate"], turned[6:].mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(window["body_rate"], measured["body_rate"][7:].mean(), rtol=1e-12)
+
+
+def test_a_motor_that_stands_still_in_the_body_turns_with_it_in_the_lab():
+    # The body turns about its axis at 100 Hz; of that a motor axis at 60 degrees to it sees a half.
+    times = np.linspace(0.0, 2e-3, 21)
+    half = np.pi * 100.0 * times
+    orientations = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    axes = np.array([[np.sin(np.pi / 3), 0.0, 0.5], [0.0, 0.0, -1.0]])
+    angles = np.outer(times, [0.0, 2 * np.pi * 300.0])
+    rates = observables.lab_motor_rate(times, angles, orientations, axes)
+    np.testing.assert_allclose(rates, [50.0, 200.0], rtol=1e-12)
+
+
+def test_a_violated_guard_keeps_the_sound_frames(tmp_path, monkeypatch):
+    # Explicit Euler far above its stable step, but only from the fourth frame on.
+    scene = small({"numerics.stepper": "euler", "duration": 8e-7, "frames": 8})
+    started = run.start(scene, str(tmp_path / "made"), "cpu")
+    advance = Simulation.advance
+
+    def reckless(self, until, watch=None):
+        if until > 3.5e-7:
+            self.system.control.longest_step.fill_(1e-7)
+        advance(self, until, watch)
+
+    monkeypatch.setattr(Simulation, "advance", reckless)
+    outcome = started.execute(quiet=True)
+    assert outcome.status == "stopped"
+    assert "\n" not in outcome.message and "flagellum" in outcome.message and "numerics.time_step" in outcome.message
+    said = summary(tmp_path / "made")
+    assert said["status"] == "stopped" and said["guards"]["violated"]["time"] > said["time"]
+    assert said["message"] in outcome.message
+    with Record(tmp_path / "made") as record:
+        assert said["frames"] == record.frame_count >= 4
+        monkeypatch.undo()
+        sound = executed(scene, tmp_path / "sound")
+        np.testing.assert_array_equal(record.positions[:4], arrays(sound)["positions"][:4])

@@ -1,0 +1,140 @@
+"""A simulation from Python: checkpoints, starts from a record, reporters, batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.runs import assert_same_frames, executed, interrupt_at, small
+from warpflag.record import Frame, Record
+from warpflag.record.recorder import Recorder
+from warpflag.run import run
+from warpflag.run.simulation import NumericalError, Simulation
+from warpflag.scene import SceneError
+
+STEPPERS = {
+    "rkc": {},
+    "euler": {"numerics.stepper": "euler", "duration": 4e-7},
+    "implicit": {"numerics.stepper": "implicit"},
+    "float32": {"numerics.precision": "float32"},
+}
+
+
+@pytest.mark.parametrize("values", STEPPERS.values(), ids=STEPPERS)
+def test_a_restored_simulation_goes_on_with_the_same_bits(values, device):
+    scene = small(values)
+    one = Simulation(scene, device=device)
+    frames, kept = [], {}
+    for index, frame in enumerate(one.frames(scene.duration)):
+        frames.append(frame)
+        kept[index] = one.checkpoint()
+    for index in (0, 3, 7):
+        other = Simulation(scene, device=device)
+        other.restore(kept[index])
+        rest = list(other.frames(scene.duration))
+        assert len(rest) == 8 - index
+        for a, b in zip(frames[index + 1 :], rest, strict=True):
+            assert (a.time, a.step) == (b.time, b.step)
+            np.testing.assert_array_equal(a.positions, b.positions)
+            np.testing.assert_array_equal(a.directors, b.directors)
+            for name, value in a.observables.items():
+                np.testing.assert_array_equal(value, b.observables[name])
+
+
+def test_a_checkpoint_of_other_cells_is_refused():
+    kept = Simulation(small(), device="cpu").checkpoint()
+    for values in ({"flagella.length": 2.4}, {"numerics.stepper": "rkc"}):
+        with pytest.raises(ValueError, match="checkpoint is of"):
+            Simulation(small(values), device="cpu").restore(kept)
+
+
+def test_a_scene_starts_from_a_frame_of_a_record(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    for index in (-1, 3):
+        scene = small({"start.record": str(directory), "start.frame": index, "motor.torque": 1.0})
+        simulation = Simulation(scene, device="cpu")
+        first = next(simulation.frames(scene.duration))
+        with Record(directory) as record:
+            frame = record.frame(index)
+        np.testing.assert_allclose(first.positions, frame.positions, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(first.directors, frame.directors, rtol=0, atol=1e-14)
+        np.testing.assert_array_equal(first.body_orientation, frame.body_orientation)
+        assert first.time == 0.0 and first.step == 0 and (first.motor_angle == 0).all()
+        assert first.observables["phase_difference"] == pytest.approx(frame.observables["phase_difference"], abs=1e-12)
+        assert first.observables["elastic_energy"] == pytest.approx(frame.observables["elastic_energy"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"flagella.length": 2.4}, "segments"),
+        ({"flagella.count": 3}, "segments"),
+        ({"start.frame": 9}, "frames 0 to 8"),
+        ({"flagella.anchor_offset": 0.5}, "anchors flagellum 0 elsewhere"),
+        ({"start.record": "nowhere"}, "no such record"),
+    ],
+)
+def test_a_record_of_another_cell_is_no_start(values, words, tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    with pytest.raises(SceneError, match=words):
+        Simulation(small({"start.record": str(directory), **values}), device="cpu")
+
+
+def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path, monkeypatch):
+    origin = executed(small(), tmp_path / "origin")
+    scene = small({"start.record": str(origin)})
+    whole = executed(scene, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 4)
+        run.start(scene, str(tmp_path / "halved"), "cpu").execute(quiet=True)
+    (origin / "run.h5").unlink()
+    run.resume(str(tmp_path / "halved")).execute(quiet=True)
+    assert_same_frames(whole, tmp_path / "halved")
+
+
+class Listener:
+    """A reporter that keeps what it is told."""
+
+    def __init__(self):
+        self.heard: list[str] = []
+        self.frames: list[Frame] = []
+
+    def start(self, scene_text, first_node, **facts):
+        self.heard.append("start")
+
+    def write(self, frame):
+        self.heard.append("write")
+        self.frames.append(frame)
+
+    def close(self):
+        self.heard.append("close")
+
+
+def test_reporters_take_the_frames_of_one_run(tmp_path):
+    listener = Listener()
+    simulation = Simulation(small(), device="cpu", reporters=[listener, Recorder(tmp_path / "run.h5")])
+    simulation.run(4.5e-5)
+    assert listener.heard == ["start", *["write"] * 5, "close"]
+    assert simulation.state.time == pytest.approx(4.5e-5) and listener.frames[-1].time == pytest.approx(4e-5)
+    simulation.run()
+    assert simulation.state.time == small().duration and len(listener.frames) == 5
+    with Record(tmp_path / "run.h5") as record:
+        assert record.frame_count == 5
+        np.testing.assert_array_equal(record.positions[-1], listener.frames[-1].positions)
+
+
+def test_reporters_are_closed_when_a_guard_is_violated():
+    listener = Listener()
+    scene = small({"numerics.stepper": "euler", "numerics.time_step": 1e-6})
+    with pytest.raises(NumericalError):
+        Simulation(scene, device="cpu", reporters=[listener]).run()
+    assert listener.heard[-1] == "close"
+
+
+def test_a_batch_has_no_reporters_but_runs():
+    batch = [small(), small({"motor.torque": 2.0})]
+    with pytest.raises(ValueError, match="single scene"):
+        Simulation(batch, device="cpu", reporters=[Listener()]).run()
+    simulation = Simulation(batch, device="cpu")
+    simulation.run()
+    assert simulation.cell_state(1).time == small().duration

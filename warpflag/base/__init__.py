@@ -1,0 +1,1 @@
+"""Devices, output files and progress: what the other rooms stand on."""

@@ -1,0 +1,1 @@
+"""From a scene to device arrays: initial shapes, starts, terms."""

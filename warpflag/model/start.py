@@ -1,0 +1,84 @@
+"""Where a simulation starts: a scene's own initial shape, or a frame of a record."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpflag.model.geometry import InitialState, initial_state
+from warpflag.record import Frame, Record, RecordError
+from warpflag.scene import Scene, SceneError
+
+__all__ = ["shape_of_frame", "starting_state"]
+
+_ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
+
+
+def starting_state(scene: Scene) -> InitialState:
+    """The shape that a scene asks for, at time 0.
+
+    Raises SceneError where `start.record` can't be read or holds another cell than the scene's, and where the scene's
+    own shape begins inside the body.
+    """
+    if scene.start.record is None:
+        start = initial_state(scene)
+        if scene.body.contact:
+            _check_outside(scene, start)
+        return start
+    try:
+        with Record(scene.start.record) as record:
+            if scene.start.frame >= record.frame_count:
+                problem = f"{record.path} holds frames 0 to {record.frame_count - 1}"
+                raise SceneError("start.frame", scene.start.frame, problem, ["start.record"])
+            first_node, frame = record.first_node, record.frame(scene.start.frame)
+    except RecordError as error:
+        raise SceneError(*_record_of(scene), str(error)) from None
+    counts = [spec.segment_count for spec in scene.resolved_flagella()]
+    recorded = [int(count) - 1 for count in np.diff(first_node)]
+    if counts != recorded:
+        problem = f"holds flagella of {recorded} segments, the scene's have {counts}"
+        raise SceneError(*_record_of(scene), problem, ["flagella.count", "flagella.length"])
+    start = shape_of_frame(frame, first_node)
+    _check_anchors(scene, start)
+    return start
+
+
+def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
+    """The shape of a frame, its time set to 0."""
+    return InitialState(
+        positions=tuple(np.split(frame.positions, first_node[1:-1])),
+        directors=tuple(np.split(frame.directors, first_node[1:-1])),
+        body_position=frame.body_position,
+        body_orientation=frame.body_orientation,
+    )
+
+
+def _check_outside(scene: Scene, start: InitialState) -> None:
+    """Nodes r_1..r_N well below the body's surface would be torn out of it by the contact force in the first step."""
+    half, radius = (scene.body.length - scene.body.width) / 2, scene.body.width / 2
+    for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
+        axis_points = np.zeros_like(nodes)
+        axis_points[:, 2] = np.clip(nodes[:, 2], -half, half)
+        depth = radius - np.linalg.norm(nodes - axis_points, axis=1)[1:]
+        if depth.max() > 0.0:
+            problem = (
+                f"starts flagellum {k} inside the body: node {int(depth.argmax()) + 1} is {depth.max():.3g} um deep"
+            )
+            related = ["flagella.opening_angle", "flagella.phase_difference", f"flagellum.{k}.azimuth"]
+            raise SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
+
+
+def _check_anchors(scene: Scene, start: InitialState) -> None:
+    """A record of flagella anchored elsewhere would tear them off the body in the first step."""
+    x, y, z, w = start.body_orientation
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    to_lab = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
+        around, radius = np.radians(spec.azimuth), scene.body.width / 2
+        anchor = np.array([radius * np.cos(around), radius * np.sin(around), spec.anchor_offset])
+        if np.linalg.norm(start.body_position + to_lab @ anchor - nodes[0]) > _ANCHOR_TOLERANCE:
+            problem = f"anchors flagellum {k} elsewhere on the body than the scene does"
+            raise SceneError(*_record_of(scene), problem, ["flagella.anchor_offset", "body.width"])
+
+
+def _record_of(scene: Scene) -> tuple[str, str | None]:
+    return "start.record", scene.start.record

@@ -1,0 +1,1 @@
+"""One run: the simulation, its directory, checkpoints and summary."""

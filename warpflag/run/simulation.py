@@ -1,0 +1,320 @@
+"""The driver: scenes in, frames out. It captures one pass of the stepper, replays it, and watches the guards."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpflag_kernels.base import clock as control_stage
+from warpflag_kernels.base.types import Precision
+from warpflag_kernels.contact import steric
+from warpflag_kernels.rod import elastic, reconstruction
+from warpflag_kernels.stepping import health
+
+from warpflag.base.device import find_device
+from warpflag.model.build import build_chart, build_control, build_guard, build_model, build_state
+from warpflag.model.geometry import InitialState
+from warpflag.model.start import starting_state
+from warpflag.model.terms import launch_right_hand_side
+from warpflag.record import Frame
+from warpflag.record.cell_state import CellState, Evaluation
+from warpflag.record.reporters import Reporter, start_reporter
+from warpflag.run.faults import NumericalError
+from warpflag.run.frames import frame_of
+from warpflag.scene import Scene
+from warpflag.stepping import System, make_stepper
+
+__all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
+
+_SECONDS_PER_REPLAY = 0.2
+_ROUNDING = 1e-6  # of a frame interval: times this close are the same
+# Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
+_CARRIED = (
+    *("base_position", "base_tangent", "base_director", "base_body_position", "base_body_orientation"),
+    *("flagellum_spin", "motor_angle", "body_angle"),
+)
+
+
+class Simulation:
+    """Cells on one device, advanced together; each has its own clock, step and guards.
+
+    Args:
+        scenes: one scene, or one per cell of a batch. All of a batch share precision, stepper and switches.
+        device: "cpu", "cuda:0", ...; default: Warp's preferred one.
+        starts: initial shapes, one per scene; default: from the scenes.
+        reporters: take the frames of the next `run` of a single scene, and are closed and let go at its end.
+        capture: replay a captured pass (the default) or launch every kernel from Python; same numbers.
+        strict: kernels built without reassociation, for comparisons to the last bit.
+
+    Errors:
+        SceneError: a scene can't be simulated.
+        DeviceError: there is no such device.
+        NumericalError: from `advance`, `frames` and `run`, when a guard is violated.
+    """
+
+    def __init__(
+        self,
+        scenes: Scene | Sequence[Scene],
+        *,
+        device: Any = None,
+        starts: InitialState | Sequence[InitialState] | None = None,
+        reporters: Sequence[Reporter] = (),
+        capture: bool = True,
+        strict: bool = False,
+    ) -> None:
+        self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+        if starts is None:
+            starts = [starting_state(scene) for scene in self.scenes]
+        elif isinstance(starts, InitialState):
+            starts = [starts]
+        precision = Precision(self.scenes[0].numerics.precision, strict)
+        model = build_model(self.scenes, find_device(device), precision)
+        self.device = model.device
+        state = build_state(model)
+        chart = build_chart(model, starts)
+        self.system = System(model, state, chart, build_control(model, starts), build_guard(model, chart))
+        self.stepper = make_stepper(self.system, self.scenes)
+        self.first_node = model.data.first_node.numpy()
+        self._first_flagellum = model.data.first_flagellum.numpy()
+        self.reporters = list(reporters)
+        self._framed: CellState | None = None
+        self._capture, self._graph = capture, None
+        self._checked = False
+        self._passes_per_replay = 200
+        self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
+        self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Simulated time of every cell [s], shape [cell_count]."""
+        return self.system.control.time.numpy().copy()
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Steps taken by every cell, shape [cell_count]."""
+        return self.system.control.steps.numpy().copy()
+
+    @property
+    def state(self) -> CellState:
+        """The first cell on the host, at the time it has reached."""
+        return self.cell_state()
+
+    def run(self, duration: float | None = None) -> None:
+        """Advances by a simulated time [s], by default to the end of the scene, and hands frames to the reporters.
+
+        Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state.
+        """
+        until = self.scenes[0].duration if duration is None else float(self.times[0]) + duration
+        reporters, self.reporters = self.reporters, []
+        try:
+            for reporter in reporters:
+                start_reporter(reporter, self.scenes[0], self.first_node)
+            for frame in self.frames(until) if reporters else ():
+                for reporter in reporters:
+                    reporter.write(frame)
+        finally:
+            for reporter in reporters:
+                reporter.close()
+        self.advance(until)
+
+    def frames(self, until: float, watch: Callable[[float], None] | None = None) -> Iterator[Frame]:
+        """Advances one scene to a time and yields a frame at each multiple of its duration / frames on the way.
+
+        Args:
+            until: simulated time to reach [s].
+            watch: as in `advance`.
+
+        Errors:
+            ValueError: several scenes; their cells are advanced together and read with `cell_state`.
+        """
+        if len(self.scenes) > 1:
+            raise ValueError("frames and reporters are of a single scene; advance a batch and read cell_state(cell)")
+        scene, first_node = self.scenes[0], self.first_node
+        length = float(np.mean([spec.length for spec in scene.resolved_flagella()]))
+        if self._framed is None:
+            self._framed = self._placed_state()
+            yield frame_of(self._framed, None, first_node, length)
+        k = math.floor(float(self.times[0]) / scene.duration * scene.frames + _ROUNDING)
+        last = math.floor(until / scene.duration * scene.frames + _ROUNDING)
+        while k < last:
+            k += 1
+            self.advance(scene.duration * k / scene.frames, watch)
+            before, self._framed = self._framed, self.cell_state()
+            yield frame_of(self._framed, before, first_node, length)
+
+    def prepare(self) -> None:
+        """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
+        if not self._checked:
+            self._check_start()
+        if not self._capture or self._graph is not None:
+            return
+        # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
+        # changes nothing.
+        self.system.control.at_rest.fill_(1)
+        self.stepper.launch_pass()
+        with wp.ScopedCapture(device=self.device) as captured:
+            wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
+        self._graph = captured.graph
+
+    def advance(self, until: float, watch: Callable[[float], None] | None = None) -> None:
+        """Advances every cell to one time.
+
+        Args:
+            until: simulated time to reach [s].
+            watch: called a few times a second with the time reached by the slowest cell [s].
+
+        Errors:
+            NumericalError: a guard was violated; the device holds the offending state, frames taken before are sound.
+        """
+        control, state = self.system.control, self.system.state.data
+        self.prepare()
+        waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
+        if not waiting.any():
+            self._raise_fault()
+            return
+        control.target.fill_(until)
+        state.active.assign(waiting.astype(np.int32))
+        control.unfinished.fill_(int(waiting.sum()))
+        while control.unfinished.numpy()[0] > 0:
+            control.budget.fill_(self._passes_per_replay)
+            control.proceed.fill_(1)
+            started = clock.perf_counter()
+            self._replay()
+            done = control.budget.numpy()[0] <= 0
+            if done:  # a full replay: aim at a fixed wall time between two looks from the host
+                per_pass = (clock.perf_counter() - started) / self._passes_per_replay
+                self._passes_per_replay = int(np.clip(_SECONDS_PER_REPLAY / per_pass, 20, 1_000_000))
+            if watch is not None:
+                watch(float(self.times.min()))
+        self._raise_fault()
+
+    def cell_state(self, cell: int = 0) -> CellState:
+        """One cell on the host, at the time it has reached; valid after `advance`."""
+        s, chart, model = self.system.state, self.system.chart, self.system.model
+        flagella, nodes = self._own(cell)
+        centre = chart.base_body_position.numpy()[cell]
+        elastic.elastic_energy(model, s, self._energy)
+        steric_force = 0.0
+        if model.switches.steric:
+            steric.steric_magnitudes(model, s, self._steric)
+            steric_force = 0.5 * float(self._steric.numpy()[nodes].sum(dtype=np.float64))
+        return CellState(
+            time=float(self.times[cell]),
+            step=int(self.steps[cell]),
+            positions=chart.base_position.numpy()[nodes].astype(np.float64) + centre,
+            directors=chart.base_director.numpy()[nodes].astype(np.float64),
+            tangents=chart.base_tangent.numpy()[nodes].astype(np.float64),
+            motor_angle=chart.motor_angle.numpy()[flagella].copy(),
+            body_angle=float(chart.body_angle.numpy()[cell]),
+            body_position=centre.copy(),
+            body_orientation=chart.base_body_orientation.numpy()[cell].copy(),
+            elastic_energy=self._energy.numpy()[nodes].sum(axis=0, dtype=np.float64),
+            steric_force=steric_force,
+        )
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
+        own = {name: array.numpy().copy() for name, array in self._carried().items()}
+        return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Takes back what `checkpoint` gave, in a simulation of the same scenes.
+
+        Errors:
+            ValueError: the arrays are of another simulation.
+        """
+        carried = self._carried()
+        memory = {name.partition(".")[2]: values for name, values in arrays.items() if name.startswith("stepper.")}
+        if carried.keys() != arrays.keys() - {f"stepper.{name}" for name in memory}:
+            raise ValueError("the checkpoint is of another version or another stepper")
+        if memory.keys() != self.stepper.memory().keys():
+            raise ValueError("the checkpoint is of another stepper")
+        for name, array in carried.items():
+            if array.numpy().shape != arrays[name].shape:
+                raise ValueError(f"the checkpoint is of other cells: {name} has the shape {arrays[name].shape}")
+            array.assign(arrays[name])
+        self.stepper.restart()
+        self.stepper.recall(memory)
+        self._framed = self._placed_state()
+
+    def _carried(self) -> dict[str, Any]:
+        control, chart = self.system.control, self.system.chart
+        carried = {"control.time": control.time, "control.steps": control.steps}
+        carried |= {f"chart.{name}": getattr(chart, name) for name in _CARRIED}
+        if self.system.model.switches.steric:
+            carried["guard.position"] = self.system.guard.position
+        return carried
+
+    def evaluate(self, cell: int = 0) -> Evaluation:
+        """Forces and velocities of one cell at its present state; advances nothing."""
+        model, s = self.system.model, self.system.state
+        self._place()
+        launch_right_hand_side(model, s)
+        s.data.active.zero_()
+        flagella, nodes = self._own(cell)
+
+        def host(array: Any, part: Any) -> np.ndarray:
+            return array.numpy()[part].astype(np.float64)
+
+        torques = host(s.data.spin_torque, nodes)
+        mobility = np.repeat(model.data.spin_mobility.numpy(), np.diff(self.first_node))[nodes]
+        return Evaluation(
+            forces=host(s.data.force, nodes),
+            torques=torques,
+            velocities=host(s.data.velocity, nodes),
+            spins=mobility * torques,
+            body_force=host(s.data.flagellum_force, flagella).sum(axis=0),
+            body_torque=host(s.data.flagellum_torque, flagella).sum(axis=0),
+            body_velocity=host(s.data.body_velocity, cell),
+            body_spin=host(s.data.body_spin, cell),
+        )
+
+    def _own(self, cell: int) -> tuple[slice, slice]:
+        """The flagella and the nodes of one cell."""
+        flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
+        return flagella, slice(self.first_node[flagella.start], self.first_node[flagella.stop])
+
+    def _replay(self) -> None:
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        while self.system.control.proceed.numpy()[0] > 0:
+            self.stepper.launch_pass()
+
+    def _place(self) -> None:
+        """Puts the evaluation point on the present state; every cell is active afterwards."""
+        s, chart = self.system.state, self.system.chart
+        s.data.active.fill_(1)
+        for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
+            array.zero_()
+        reconstruction.place(self.system.model, s, chart)
+
+    def _placed_state(self) -> CellState:
+        """The first cell before any step, or after a state was set from outside."""
+        self._place()
+        self.system.state.data.active.zero_()
+        return self.cell_state()
+
+    def _check_start(self) -> None:
+        """The guards look at the state that the first step starts from."""
+        model, s, chart = self.system.model, self.system.state, self.system.chart
+        self._place()
+        launch_right_hand_side(model, s)
+        chart.rest.fill_(1)
+        health.check(model, s, chart, self.system.guard, self.system.control)
+        chart.rest.zero_()
+        s.data.active.zero_()
+        self._checked = True
+
+    def _raise_fault(self) -> None:
+        faults = self.system.control.fault.numpy()
+        for cell in np.flatnonzero(faults != control_stage.NO_FAULT):
+            kind, element = health.decode(int(faults[cell]))
+            flagellum = int(np.searchsorted(self.first_node, element, side="right")) - 1
+            segment = element - int(self.first_node[flagellum])
+            own = flagellum - int(self._first_flagellum[cell])
+            raise NumericalError(kind, float(self.times[cell]), int(cell), own, segment)

@@ -1,0 +1,221 @@
+"""The sections of a scene: one frozen dataclass each, one declaration per setting.
+
+Units are um, pN and s throughout (so pN um for torques, pN s/um^2 for viscosity); angles are in degrees.
+Defaults are those of Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015), "the paper", wherever it prints a
+value; where it prints none, the class says where the value comes from.
+
+Body axes: e_b3 is the long axis and points to the rear, e_b1 is where azimuths are counted from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from warpflag.scene.settings import Section, choice, integer, number, switch, text, vector
+
+
+@dataclass(frozen=True)
+class Flagella(Section, key="flagella"):
+    """The group of flagella: how many, their shape, their elasticity and where they sit.
+
+    The paper prints the elastic constants, the ground state and the opening angles 23, 44 and 90 deg.
+    Length, segment length and anchor offset are not printed: the defaults reproduce the radius 0.22 um
+    that it quotes for the discrete helix, and offsets from 0.6 to 0.85 um keep a finished bundle.
+    """
+
+    count: int = integer(2, 1, 10_000, "number of flagella, at azimuths 360 k/count deg")
+    length: float = number(6.0, "um", 0.1, 100, "contour length of each")
+    segment_length: float = number(
+        0.2, "um", 0.01, 1, "wanted length of a segment; the nearest that divides the contour is taken"
+    )
+    opening_angle: float = number(
+        90.0, "deg", 0, 180, "angle between two opposite flagella; each helix axis is tilted by half of it"
+    )
+    phase_difference: float | None = number(
+        None,
+        "",
+        0,
+        1,
+        "initial contour average of the phase difference theta of flagella 0 and 1",
+        derived="all flagella start at the same phase angle",
+    )
+    anchor_offset: float = number(
+        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", smallest=1e-4
+    )
+    bending_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "A, the paper's")
+    twist_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "C, in the paper equal to A")
+    stretching_stiffness: float = number(1000.0, "pN", 1, 1e7, "K, the paper's")
+    intrinsic_curvature: tuple[float, float, float] = vector(
+        (0.0, 1.3, -2.1),
+        "1/um",
+        -100,
+        100,
+        "strain Omega^0 of the ground state about e1, e2, e3, the paper's; third positive: right-handed",
+    )
+    filament_radius: float = number(
+        0.010, "um", 1e-3, 0.5, "a, not printed but implied by the paper's gamma_R = 4 pi eta a^2"
+    )
+    hook_twist_factor: float = number(
+        3.0, "", 1e-3, 1e3, "twist rigidity of the hook joint over C, the paper's; it bends freely"
+    )
+
+
+@dataclass(frozen=True)
+class FlagellumOverride(Section, key="flagellum"):
+    """What one flagellum has of its own: a [[flagellum]] table. Absent fields are the group's."""
+
+    azimuth: float | None = number(None, "deg", -360, 360, "of the anchor about e_b3, from e_b1", derived="360 k/count")
+    anchor_offset: float | None = number(
+        None, "um", -50, 50, "as flagella.anchor_offset", smallest=1e-4, derived="flagella.anchor_offset"
+    )
+    motor_axis_angle: float | None = number(
+        None, "deg", 0, 180, "motor axis to e_b3, toward the outward normal", derived="motor.axis_angle"
+    )
+    tilt: float | None = number(
+        None, "deg", 0, 180, "helix axis to e_b3, toward the normal", derived="flagella.opening_angle / 2"
+    )
+    torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", smallest=1e-6, derived="motor.torque")
+    length: float | None = number(None, "um", 0.1, 100, "contour length", derived="flagella.length")
+    segments: int | None = integer(
+        None, 2, 10_000, "number of segments", derived="length / flagella.segment_length, rounded"
+    )
+    phase: float | None = number(
+        None,
+        "deg",
+        -360,
+        360,
+        "angle of the anchor about the helix axis, which points away from the body, counted from the lab's "
+        "x axis projected across it",
+        derived="180; flagella of odd number shifted to reach flagella.phase_difference",
+    )
+
+
+@dataclass(frozen=True)
+class Motor(Section, key="motor"):
+    """The rotary motors and their hooks. The paper: T_m = 3.4 pN um, phi_m = 55 deg.
+
+    Its text gives the body the motor torques and the forces at the anchors only (bearing_torque = false).
+    """
+
+    torque: float = number(
+        3.4, "pN um", -1e3, 1e3, "on each flagellum about the motor axis; negative: reversed", smallest=1e-6
+    )
+    axis_angle: float = number(55.0, "deg", 0, 180, "motor axis to e_b3, toward the outward normal")
+    bearing_torque: bool = switch(
+        True, "the body also takes the torque across the motor axis, so that the swimmer is torque-free"
+    )
+
+
+@dataclass(frozen=True)
+class Fluid(Section, key="fluid"):
+    """The fluid and the drag of a filament in it, per unit length.
+
+    The paper prints the drags for water: 1.6e-3 and 2.8e-3 pN s/um^2, 1.26e-6 pN s. It prints no
+    viscosity; these drags invert to 1e-3 pN s/um^2.
+    """
+
+    viscosity: float = number(1e-3, "pN s/um^2", 1e-5, 10, "eta; water: 1e-3, the same number as in Pa s")
+    drag_parallel: float | None = number(None, "pN s/um^2", 1e-6, 100, "gamma_par", derived="1.6e-3 viscosity / 1e-3")
+    drag_perpendicular: float | None = number(
+        None, "pN s/um^2", 1e-6, 100, "gamma_perp", derived="2.8e-3 viscosity / 1e-3"
+    )
+    drag_rotation: float | None = number(
+        None, "pN s", 1e-10, 1, "gamma_R, spin about the tangent", derived="1.26e-6 viscosity / 1e-3"
+    )
+
+
+@dataclass(frozen=True)
+class Hydrodynamics(Section, key="hydrodynamics"):
+    """Which flows of one node are felt by another.
+
+    none: local drag only. within: nodes of the same flagellum. between: nodes of different flagella.
+    all: both, the paper's sum, with a radius that keeps it positive definite. as_printed: the paper's sum
+    with the filament radius, which is not positive definite at contact. consistent: a pair sum that does
+    not count a filament's own flow twice and converges with the segment length.
+    """
+
+    mode: str = choice("all", ("none", "within", "between", "all", "as_printed", "consistent"), "pairs that are summed")
+    pair_radius: float | None = number(
+        None,
+        "um",
+        1e-3,
+        1,
+        "radius of the Rotne-Prager pair term",
+        derived="filament_radius with as_printed, else the least that keeps the mobility positive definite; "
+        "that is max(filament_radius, drag_perpendicular h / (6 pi viscosity)) unless consistent, h the "
+        "longest segment",
+    )
+
+
+@dataclass(frozen=True)
+class Steric(Section, key="steric"):
+    """Contact of flagella with each other (and of their nodes with the body, see Body.contact).
+
+    Force F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma. The paper: F_0 = 0.8 pN, sigma = 4a.
+    """
+
+    enabled: bool = switch(True, "flagella repel each other")
+    strength: float = number(0.8, "pN", 1e-6, 1e5, "F_0, the force at distance sigma")
+    diameter: float | None = number(None, "um", 1e-3, 1, "sigma", derived="4 flagella.filament_radius")
+
+
+@dataclass(frozen=True)
+class Body(Section, key="body"):
+    """The cell body: a spherocylinder to the flagella, a prolate spheroid to the fluid. Sizes: the paper.
+
+    The three motions are the paper's ablations; anchored takes all of them.
+    """
+
+    length: float = number(2.5, "um", 0.1, 100, "L_b, caps included")
+    width: float = number(0.8, "um", 0.05, 50, "d_b, not above the length")
+    contact: bool = switch(True, "the body's surface repels the nodes of flagella")
+    translation: bool = switch(True, "the body moves")
+    axial_rotation: bool = switch(True, "the body turns about its long axis")
+    anchored: bool = switch(False, "the body neither moves nor turns, whatever the two switches above say")
+
+
+@dataclass(frozen=True)
+class Numerics(Section, key="numerics"):
+    """How time is stepped. Nothing here is physics."""
+
+    stepper: str = choice(
+        "implicit",
+        ("euler", "rkc", "implicit"),
+        "explicit Euler, stabilised explicit Runge-Kutta-Chebyshev, or linearly implicit",
+    )
+    time_step: float | None = number(
+        None,
+        "s",
+        1e-14,
+        1e-2,
+        "fixed step, not above the duration",
+        derived="from numerics.accuracy; euler: just below its stability limit",
+    )
+    precision: str = choice("float64", ("float64", "float32"), "floating point numbers of forces and positions")
+    accuracy: float | None = number(
+        None,
+        "um",
+        1e-9,
+        1,
+        "wanted node error per simulated ms",
+        derived="5e-3 with implicit; rkc takes fixed steps of 1e-5 s",
+    )
+    pair_precision: str = choice(
+        "same",
+        ("same", "float32"),
+        "numbers of the flow of one pair; float32: those alone, added up in numerics.precision",
+    )
+
+
+@dataclass(frozen=True)
+class Start(Section, key="start"):
+    """Where the run starts: from the scene's own shape, or from a frame of a record.
+
+    A record brings the flagella's shape, their phases and the body's pose; phases that the scene gives are
+    then unused.
+    """
+
+    record: str | None = text(
+        None, "run directory or run.h5, from the working directory", derived="the scene's own shape"
+    )
+    frame: int = integer(-1, -1, 10**9, "frame of the record; -1 is the last")

@@ -1,0 +1,137 @@
+"""Runge-Kutta-Chebyshev stepping (and Euler, its one-stage form) of every cell of a system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpflag_kernels.base import clock
+from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping import health, rkc
+
+from warpflag.model.terms import launch_right_hand_side
+from warpflag.scene import Scene
+from warpflag.scene.resistance import filament_mobility
+from warpflag.stepping.stepper import STEP_MEMORY, System, build_step_control, restart_step_control
+
+__all__ = ["EULER_STEPS_PER_CHECK", "RKC_STEP", "RkcStepper", "euler_step"]
+
+RKC_STEP = 1.0e-5
+"""Default step of RKC [s]: node errors of about 1e-3 um after 1 ms of the zipping scene."""
+LONGEST_STEP = 1.0e-4
+"""Longest step of RKC under accuracy control [s]."""
+EULER_STEPS_PER_CHECK = 100
+
+
+def euler_step(scene: Scene) -> float:
+    """Largest sound step of explicit Euler [s]: 0.9 of the limit set by the hook's and the filament's twist."""
+    rate = 0.0
+    for spec in scene.resolved_flagella():
+        h, group = spec.segment_length, scene.flagella
+        spin = filament_mobility(scene, h).spin
+        # Gershgorin bound of the twist chain: tripod - hook - filament.
+        hook = group.hook_twist_factor * group.twist_rigidity / h
+        twist = spin * (2 * hook + 2 * group.twist_rigidity / h)
+        along, across = filament_mobility(scene, h).along, filament_mobility(scene, h).across
+        stretch = 4 * group.stretching_stiffness / h * (along + across)
+        rate = max(rate, twist + stretch + 16 * group.bending_rigidity / h**3 * across)
+    return 0.9 * 2.0 / rate
+
+
+class RkcStepper:
+    """RKC2 with a spectral radius followed by the power method; with `euler` one stage and no probe.
+
+    Args:
+        system: what to advance.
+        scenes: one per cell; `numerics.time_step` is the longest step, else the method's default.
+        euler: explicit Euler, the oracle.
+    """
+
+    def __init__(self, system: System, scenes: Sequence[Scene], euler: bool) -> None:
+        self._system, self._euler = system, euler
+        model = system.model
+        cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+        p, device = model.precision, model.device
+        r = rkc.struct(p)()
+
+        def zeros(count: int, dtype: Any) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=device)
+
+        r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
+        r.body_previous, r.body_before_previous, r.body_start_rate = (
+            zeros(cells, comoving_chart.vec6d) for _ in range(3)
+        )
+        r.stage, r.stages, r.probes_left = (zeros(cells, wp.int32) for _ in range(3))
+        r.evaluations = zeros(cells, wp.int32)
+        r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
+        r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
+        r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
+        self.data = r
+        fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
+        accuracies = [0.0 if f else s.numerics.accuracy or 0.0 for f, s in zip(fixed, scenes, strict=True)]
+        self.steps = build_step_control(accuracies, device)
+        longest = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
+        longest = [step if f else LONGEST_STEP for f, step in zip(fixed, longest, strict=True)]
+        system.control.longest_step.assign(longest)
+        system.guard.interval.fill_(EULER_STEPS_PER_CHECK if euler else 1)
+        self._controlled = any(accuracies)
+        self._seed_probe()
+        self.restart()
+
+    def launch_pass(self) -> None:
+        s = self._system
+        rkc.begin_pass(s.model, s.state, s.chart, s.control, self.steps, self.data, self._euler)
+        reconstruction.place(s.model, s.state, s.chart)
+        launch_right_hand_side(s.model, s.state)
+        # Most passes are stages inside a step: what happens between steps is not even launched there.
+        wp.capture_if(s.control.at_rest, self._launch_between_steps)
+        comoving_chart.increment_rates(s.model, s.state, s.chart)
+        rkc.end_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
+        clock.count_pass(s.control, s.model.device)
+
+    def _launch_between_steps(self) -> None:
+        s = self._system
+        health.check(s.model, s.state, s.chart, s.guard, s.control)
+        if not self._euler and self._controlled:
+            comoving_chart.increment_rates(s.model, s.state, s.chart)
+            rkc.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
+        comoving_chart.commit(s.model, s.state, s.chart)
+        health.remember(s.model, s.state, s.chart, s.guard, s.control)
+        if not self._euler:
+            comoving_chart.fit_flagellum_spin(s.model, s.state, s.chart)
+
+    def restart(self) -> None:
+        restart_step_control(self.steps, np.zeros(len(self.steps.tolerance)))
+        self.data.stage.fill_(-1)
+        self.data.stages.fill_(1)
+        self.data.probes_left.fill_(rkc.FIRST_PROBES)
+
+    def memory(self) -> dict[str, np.ndarray]:
+        names = ("stage", "start_rate", "body_start_rate", "evaluations")
+        names += ("probe", "probe_norm", "probes_left", "spectral_radius")
+        kept = {name: getattr(self.data, name).numpy().copy() for name in names}
+        return kept | {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
+
+    def recall(self, memory: dict[str, np.ndarray]) -> None:
+        for name, values in memory.items():
+            getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
+
+    def _seed_probe(self) -> None:
+        """A direction with a share of every mode: random, but the same in every run and every cell."""
+        model = self._system.model
+        first = model.data.first_node.numpy()
+        cell_first = first[model.data.first_flagellum.numpy()]
+        probe = np.zeros((model.element_count, 4))
+        norms = np.zeros(model.cell_count)
+        h = np.repeat(model.data.segment_length.numpy().astype(np.float64), np.diff(first))
+        for c in range(model.cell_count):
+            cell = slice(cell_first[c], cell_first[c + 1])
+            random = np.random.default_rng(0).standard_normal((cell.stop - cell.start, 4))
+            norms[c] = np.linalg.norm(random)
+            probe[cell] = random
+        probe[:, :3] *= h[:, None]
+        probe[first[:-1], :3] = 0.0
+        self.data.probe.assign(probe)
+        self.data.probe_norm.assign(norms)

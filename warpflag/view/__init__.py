@@ -1,0 +1,1 @@
+"""Movies, pictures, curves and exports, all from the record."""

@@ -1,0 +1,124 @@
+"""Colours of the nodes by a quantity: which there are, their ranges, and linear RGB as USD's displayColor wants it.
+
+Ranges are fixed by the scene, not by the data: equal colours mean equal values in any two movies of a scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from warpflag.record import Record
+from warpflag.scene import Scene
+from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
+
+__all__ = ["BODY_COLOR", "QUANTITIES", "Coloring", "linear", "map_color"]
+
+QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force")
+
+_PRIMVARS = {
+    "flagellum": "flagellum",
+    "phase_difference": "phaseDifference",
+    "curvature": "curvature",
+    "steric_force": "stericForce",
+}
+_LABELS = {"phase_difference": "phase difference", "curvature": "curvature 1/µm", "steric_force": "steric force pN"}
+
+# Okabe & Ito's colours, told apart by colour-blind eyes too, darkest first; repeated beyond seven flagella.
+_FLAGELLUM_COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6fc4")
+# Samples of a map that grows evenly in lightness: dark violet, red, orange, pale yellow.
+_MAP = ("#2b1055", "#5c126e", "#8f2469", "#bf3952", "#e35933", "#f98c0a", "#f9c932", "#fcf4a3")
+_UNDEFINED_COLOR = "#9a9a9a"
+BODY_COLOR = "#dfcfae"
+
+
+def linear(color: str) -> NDArray[np.float32]:
+    """Linear RGB of a colour "#rrggbb" in sRGB."""
+    return _decoded(_srgb(color))
+
+
+def map_color(share: ArrayLike) -> NDArray[np.float64]:
+    """Colour of the map at a share of its range, sRGB 0 to 255, shape [..., 3]."""
+    at = np.clip(share, 0.0, 1.0)
+    table = np.stack([_srgb(color) for color in _MAP])
+    return 255.0 * np.stack([np.interp(at, np.linspace(0.0, 1.0, len(table)), table[:, i]) for i in range(3)], axis=-1)
+
+
+def _srgb(color: str) -> NDArray[np.float64]:
+    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+
+
+def _decoded(srgb: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Linear intensities of sRGB in 0 to 1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Coloring:
+    """How a record's nodes are coloured by one of `QUANTITIES`.
+
+    flagellum: a colour each. phase_difference: `nearest_phase_difference`, 0 to 1. curvature: `curvature`, 0 to
+    twice the intrinsic one. steric_force: `contact_load`, 0 to 8 F_0, a firm contact of two bundled flagella.
+    """
+
+    quantity: str
+    record: Record
+    scene: Scene
+
+    @property
+    def primvar(self) -> str:
+        """Name of the primvar with the raw values."""
+        return _PRIMVARS[self.quantity]
+
+    @property
+    def label(self) -> str:
+        """Name and unit for a legend; empty where colours only tell flagella apart."""
+        return _LABELS.get(self.quantity, "")
+
+    @property
+    def changes(self) -> bool:
+        """Whether the colours change from frame to frame."""
+        return self.quantity != "flagellum"
+
+    @cached_property
+    def highest(self) -> float:
+        """The value of the last colour; the first one's is 0."""
+        bend = np.hypot(*self.scene.flagella.intrinsic_curvature[:2])
+        return float(
+            {
+                "flagellum": len(self.record.first_node) - 2,
+                "phase_difference": 1.0,
+                "curvature": 2.0 * bend or 1.0,
+                "steric_force": 8.0 * self.scene.steric.strength or 1.0,
+            }[self.quantity]
+        )
+
+    def values(self, positions: NDArray[np.floating], frames: slice) -> NDArray[np.floating]:
+        """The quantity at the nodes of a block of frames, shape [frame, node]; of a single row where it never changes.
+
+        positions: of these frames [um], shape [frame, node, 3].
+        """
+        first_node = self.record.first_node
+        if self.quantity == "flagellum":
+            return np.repeat(np.arange(len(first_node) - 1.0), np.diff(first_node))[None]
+        if self.quantity == "curvature":
+            return curvature(positions, first_node)
+        if self.quantity == "phase_difference":
+            return nearest_phase_difference(positions, self.record.directors[frames], first_node)
+        steric = self.scene.steric
+        diameter = 4.0 * self.record.filament_radius if steric.diameter is None else steric.diameter
+        return contact_load(positions, first_node, steric.strength if steric.enabled else 0.0, diameter)
+
+    def colors(self, values: ArrayLike) -> NDArray[np.float32]:
+        """Linear RGB of values, shape [..., 3]; grey where they are undefined."""
+        values = np.asarray(values, float)
+        if self.quantity == "flagellum":
+            table = np.stack([linear(color) for color in _FLAGELLUM_COLORS])
+            return table[values.astype(int) % len(table)]
+        # By a table of 256: decoding each of millions of values would take longer than all the rest.
+        table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(_UNDEFINED_COLOR)])
+        index = np.where(np.isnan(values), 256, np.clip(255.0 * values / self.highest + 0.5, 0.0, 255.0))
+        return table[index.astype(int)]

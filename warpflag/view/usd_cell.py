@@ -1,0 +1,218 @@
+"""One cell of a movie: body, flagella, motors and materials as USD prims, and their samples frame by frame.
+
+CELL                component; custom attribute warpflag:time [s], time-sampled
+CELL/Body           Capsule along its z axis, in the body's pose
+CELL/Flagella       BasisCurves through every node, one curve each, coloured at the nodes
+CELL/Motors         in the body's pose, with a Motor_K per flagellum
+CELL/Motors/Motor_K three spokes along e1, e2 and m of the motor tripod, turned about m by the motor angle
+CELL/Looks          materials: UsdPreviewSurface with the display colour
+"""
+
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+# (pxr comes without type stubs)
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpflag.record import Record
+from warpflag.scene import Scene
+from warpflag.view.coloring import BODY_COLOR, Coloring, linear
+from warpflag.view.usd_shot import Extent, body_axes
+
+__all__ = ["UNDEFINED", "Cell"]
+
+UNDEFINED = -1.0
+"""Raw value of a node at which a quantity is not defined: in a USD file a NaN is a fault."""
+
+_SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
+_SPOKE_WIDTH = 0.07
+_SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
+
+
+class Cell:
+    """Authors the prims of a record's cell at `path` on a stage; `samples` yields what changes with the frame.
+
+    xform, prim: of the cell. coloring: of its nodes. animated: value type of each attribute that `samples` fills, by
+    its path.
+    """
+
+    def __init__(self, stage: Any, path: str, record: Record, scene: Scene, color_by: str):
+        from pxr import Sdf, Usd, UsdGeom
+
+        self._stage, self._path, self._record, self._scene = stage, path, record, scene
+        self.coloring = Coloring(color_by, record, scene)
+        # A few numbers per frame, read once; the nodes are read block by block.
+        self._times, self._motor_angles = record.times, record.motor_angle
+        self._positions, self._orientations = record.body_position, record.body_orientation
+        self.animated: dict[Any, Any] = {}
+        self.xform = UsdGeom.Xform.Define(stage, path)
+        self.prim = self.xform.GetPrim()
+        Usd.ModelAPI(self.prim).SetKind("component")
+        self.prim.SetCustomData({"warpflag": {"scene": scene.name, "sceneSha256": record.scene_sha256}})
+        time = self.prim.CreateAttribute("warpflag:time", Sdf.ValueTypeNames.Double, custom=True)
+        time.SetDocumentation("Simulated time [s].")
+        self._time = self._animate(time)
+        UsdGeom.Scope.Define(stage, f"{path}/Looks")
+        body = self._add_body()
+        self._poses = [self._add_pose(body), self._add_pose(UsdGeom.Xform.Define(stage, f"{path}/Motors"))]
+        self._turns = self._add_motors()
+        self._points, self._extent, self._colors, self._values = self._add_flagella()
+
+    def samples(self, frames: slice, extent: Extent) -> Iterator[tuple[Any, int, Any]]:
+        """Attribute path, frame and value of everything that changes, for a block of frames; `extent` grows by them."""
+        from pxr import Gf, Vt
+
+        radius = self._record.filament_radius
+        positions = self._record.positions[frames]
+        turned = np.degrees(self._motor_angles[frames])
+        colors = values = None
+        if self.coloring.changes:
+            values = self.coloring.values(positions, frames)
+            colors, values = self.coloring.colors(values), np.nan_to_num(values, nan=UNDEFINED).astype(np.float32)
+        points = positions.astype(np.float32)
+        low, high = points.min(axis=1) - np.float32(radius), points.max(axis=1) + np.float32(radius)
+        extent.add(frames, positions, radius)
+        extent.add(frames, self._body_ends(frames), 0.5 * self._record.body_width)
+        for i, frame in enumerate(range(frames.start, frames.stop)):
+            yield self._time, frame, float(self._times[frame])
+            yield self._points, frame, Vt.Vec3fArray.FromNumpy(points[i])
+            yield self._extent, frame, Vt.Vec3fArray.FromNumpy(np.stack([low[i], high[i]]))
+            if colors is not None and values is not None:
+                yield self._colors, frame, Vt.Vec3fArray.FromNumpy(colors[i])
+                yield self._values, frame, Vt.FloatArray.FromNumpy(values[i])
+            x, y, z, w = self._orientations[frame].tolist()
+            for translate, orient in self._poses:
+                yield translate, frame, Gf.Vec3d(*self._positions[frame].tolist())
+                yield orient, frame, Gf.Quatd(w, x, y, z)
+            for turn, angle in zip(self._turns, turned[i].tolist(), strict=True):
+                yield turn, frame, angle
+
+    def _body_ends(self, frames: slice) -> NDArray[np.float64]:
+        """Middles of the body's round ends [um], shape [frame, 2, 3]."""
+        half = 0.5 * (self._record.body_length - self._record.body_width)
+        axes = np.stack([body_axes(orientation)[2] for orientation in self._orientations[frames]])
+        return self._positions[frames][:, None] + half * axes[:, None] * np.array([[-1.0], [1.0]])
+
+    def _animate(self, attribute: Any) -> Any:
+        self.animated[attribute.GetPath()] = attribute.GetTypeName()
+        return attribute.GetPath()
+
+    def _add_pose(self, prim: Any) -> tuple[Any, Any]:
+        from pxr import UsdGeom
+
+        translate = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+        orient = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+        return self._animate(translate.GetAttr()), self._animate(orient.GetAttr())
+
+    def _add_body(self) -> Any:
+        from pxr import Gf, UsdGeom
+
+        record = self._record
+        radius, height = 0.5 * record.body_width, record.body_length - record.body_width
+        body = UsdGeom.Capsule.Define(self._stage, f"{self._path}/Body")
+        body.CreateAxisAttr(UsdGeom.Tokens.z)
+        body.CreateRadiusAttr(radius)
+        body.CreateHeightAttr(height)
+        corner = Gf.Vec3f(radius, radius, 0.5 * height + radius)
+        body.CreateExtentAttr([-corner, corner])
+        body.CreateDisplayColorAttr([Gf.Vec3f(*linear(BODY_COLOR).tolist())])
+        self._bind_material(body.GetPrim(), "BodyMaterial", roughness=0.6)
+        return body
+
+    def _add_flagella(self) -> tuple[Any, Any, Any, Any]:
+        from pxr import Sdf, UsdGeom, Vt
+
+        record, coloring = self._record, self.coloring
+        curves = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Flagella")
+        curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
+        curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
+        curves.CreateWrapAttr(UsdGeom.Tokens.pinned)
+        curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(np.diff(record.first_node).astype(np.int32)))
+        curves.CreateWidthsAttr([2.0 * record.filament_radius])
+        curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        colors = curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).GetAttr()
+        raw = UsdGeom.PrimvarsAPI(curves).CreatePrimvar(
+            coloring.primvar, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex
+        )
+        if not coloring.changes:
+            values = coloring.values(np.empty((0, 0, 0)), slice(0, 0))[0]
+            colors.Set(Vt.Vec3fArray.FromNumpy(coloring.colors(values)))
+            raw.Set(Vt.FloatArray.FromNumpy(values.astype(np.float32)))
+        self._bind_material(curves.GetPrim(), "FlagellaMaterial", roughness=0.4)
+        changing = [curves.CreatePointsAttr(), curves.CreateExtentAttr()]
+        paths = [self._animate(attribute) for attribute in changing]
+        if coloring.changes:
+            return paths[0], paths[1], self._animate(colors), self._animate(raw.GetAttr())
+        return paths[0], paths[1], None, None
+
+    def _add_motors(self) -> list[Any]:
+        """A motor per flagellum, its tripod at angle 0 set into the body; returns where the angles go."""
+        from pxr import Gf, UsdGeom
+
+        record = self._record
+        first = record.first_node[:-1]
+        to_body = body_axes(self._orientations[0])  # rows: the body's axes in the lab
+        anchors = (record.positions[0][first] - self._positions[0]) @ to_body.T
+        e1, axes = record.directors[0][first] @ to_body.T, _motor_axes(self._scene)
+        turns = []
+        for k, (anchor, director, axis) in enumerate(zip(anchors, e1, axes, strict=True)):
+            back = self._motor_angles[0, k]  # the angle at the first frame need not be 0
+            director = np.cos(back) * director - np.sin(back) * np.cross(axis, director)
+            tripod = Gf.Matrix3d(*np.stack([director, np.cross(axis, director), axis]).ravel().tolist())
+            motor = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Motors/Motor_{k}")
+            motor.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*anchor.tolist()))
+            motor.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(
+                tripod.GetOrthonormalized().ExtractRotation().GetQuat()
+            )
+            turns.append(self._animate(motor.AddRotateZOp(UsdGeom.XformOp.PrecisionDouble).GetAttr()))
+            self._add_spokes(motor)
+        return turns
+
+    def _add_spokes(self, motor: Any) -> None:
+        from pxr import UsdGeom, Vt
+
+        points = np.zeros((6, 3), dtype=np.float32)
+        points[1::2] = np.diag(_SPOKE_LENGTHS)
+        motor.CreateTypeAttr(UsdGeom.Tokens.linear)
+        motor.CreateCurveVertexCountsAttr([2, 2, 2])
+        motor.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+        motor.CreateWidthsAttr([_SPOKE_WIDTH])
+        motor.SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        half = 0.5 * _SPOKE_WIDTH
+        extent = np.array([[-half] * 3, np.add(_SPOKE_LENGTHS, half)], dtype=np.float32)
+        motor.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+        colors = np.stack([linear(color) for color in _SPOKE_COLORS])
+        motor.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(colors))
+        self._bind_material(motor.GetPrim(), "FlagellaMaterial", roughness=0.4)
+
+    def _bind_material(self, prim: Any, name: str, roughness: float) -> None:
+        """A plain surface that shows the prim's displayColor, whatever its interpolation."""
+        from pxr import Sdf, UsdShade
+
+        stage, path = self._stage, f"{self._path}/Looks/{name}"
+        material = UsdShade.Material.Get(stage, path)
+        if not material:
+            material = UsdShade.Material.Define(stage, path)
+            reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Color"))
+            reader.CreateIdAttr("UsdPrimvarReader_float3")
+            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+            color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+            surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
+            surface.CreateIdAttr("UsdPreviewSurface")
+            surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
+            surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
+            output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+            material.CreateSurfaceOutput().ConnectToSource(output)
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+
+
+def _motor_axes(scene: Scene) -> NDArray[np.float64]:
+    """The motor axes m in body axes, shape [flagellum_count, 3]."""
+    specs = scene.resolved_flagella()
+    angle, around = (np.radians([getattr(spec, name) for spec in specs]) for name in ("motor_axis_angle", "azimuth"))
+    return np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1)

@@ -1,0 +1,181 @@
+"""A movie read back for drawing: its curves and capsules as rods, its camera, light and times, at any time code."""
+
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+# (pxr comes without type stubs)
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpflag.base.output import OutputError
+
+__all__ = ["Camera", "Film", "Rods", "opened"]
+
+Array = NDArray[np.float64]
+
+_PIECES = 4  # straight pieces per span of a cubic curve
+# Catmull-Rom weights of the four points about a span, at the ends of its pieces; a linear curve has one piece.
+_T = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
+_CUBIC = 0.5 * np.hstack(
+    [-_T + 2 * _T**2 - _T**3, 2 - 5 * _T**2 + 3 * _T**3, _T + 4 * _T**2 - 3 * _T**3, -(_T**2) + _T**3]
+)
+_LINEAR = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Rods:
+    """Rods with round ends: axis ends [um], radius [um], linear RGB at both ends; shapes [rod, 3], [rod]."""
+
+    start: Array
+    end: Array
+    radius: Array
+    color_start: Array
+    color_end: Array
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where a camera is and looks.
+
+    eye: [um]. right, up, back: unit vectors. tangents: of half its angles of view across and up. focus: distance of
+    the middle of the scene [um].
+    """
+
+    eye: Array
+    right: Array
+    up: Array
+    back: Array
+    tangents: tuple[float, float]
+    focus: float
+
+
+def opened(path: str | Path) -> Any:
+    """The stage of a USD file. Raises OutputError where it can't be read."""
+    from pxr import Tf, Usd
+
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException:
+        raise OutputError(f"{path}: not a readable USD file") from None
+
+
+class Film:
+    """The movie of a stage or of a .usd, .usda, .usdc or .usdz file.
+
+    start, end: time codes. codes_per_second, frames_per_second: as the stage says. facts: what the program that wrote
+    it said of it. Raises OutputError for what is no movie of this program.
+    """
+
+    def __init__(self, source: Any):
+        from pxr import UsdGeom, UsdLux
+
+        is_file = isinstance(source, str | Path)
+        name, stage = (source, opened(source)) if is_file else ("the stage", source)
+        prims = list(stage.Traverse())
+        cameras, lights, cells = (
+            [prim for prim in prims if belongs(prim)]
+            for belongs in (
+                lambda prim: prim.IsA(UsdGeom.Camera),
+                lambda prim: prim.IsA(UsdLux.DistantLight),
+                lambda prim: prim.HasAttribute("warpflag:time"),
+            )
+        )
+        if not cameras or not lights or not cells:
+            raise OutputError(f"{name}: no movie of warpflag, it lacks a camera, a light or the simulated time")
+        self._stage, self._camera, self._light, self._cell = stage, cameras[0], lights[0], cells[0]
+        self._curves = [UsdGeom.BasisCurves(prim) for prim in prims if prim.IsA(UsdGeom.BasisCurves)]
+        self._capsules = [UsdGeom.Capsule(prim) for prim in prims if prim.IsA(UsdGeom.Capsule)]
+        self.start, self.end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        self.codes_per_second, self.frames_per_second = stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()
+        self.facts: dict[str, Any] = dict(stage.GetRootLayer().customLayerData.get("warpflag", {}))
+
+    def time(self, code: float) -> float:
+        """The simulated time [s]."""
+        return self._cell.GetAttribute("warpflag:time").Get(code)
+
+    def code_at(self, time: float) -> float:
+        """The time code of a simulated time [s], or of the nearest one that the movie has."""
+        return float(np.interp(time, self._times, np.arange(self.start, self.end + 1)))
+
+    @cached_property
+    def _times(self) -> list[float]:
+        return [self.time(code) for code in np.arange(self.start, self.end + 1)]
+
+    def thinnest(self) -> float:
+        """The radius of the flagella as the movie has it, its thinnest curves [um]."""
+        return min(0.5 * curves.GetWidthsAttr().Get()[0] for curves in self._curves)
+
+    def camera(self, code: float) -> Camera:
+        """The camera."""
+        from pxr import UsdGeom
+
+        camera = UsdGeom.Camera(self._camera).GetCamera(code)
+        right, up, back, eye = np.array(camera.transform)[:, :3]
+        width, height = camera.horizontalAperture, camera.verticalAperture
+        tangents = (0.5 * width / camera.focalLength, 0.5 * height / camera.focalLength)
+        return Camera(eye, right, up, back, tangents, camera.focusDistance)
+
+    def light(self, code: float) -> tuple[Array, float]:
+        """The unit vector toward the distant light and half the angle under which it is seen [rad]."""
+        from pxr import UsdGeom, UsdLux
+
+        toward = np.array(UsdGeom.Xformable(self._light).ComputeLocalToWorldTransform(code))[2, :3]
+        angle = UsdLux.DistantLight(self._light).GetAngleAttr().Get(code)
+        return toward / np.linalg.norm(toward), np.radians(0.5 * angle)
+
+    def rods(self, code: float, least_radius: float = 0.0) -> Rods:
+        """Everything to draw; curves are drawn with `least_radius` [um] where they are thinner."""
+        from pxr import UsdGeom
+
+        placed = UsdGeom.XformCache(code)
+        parts = [_curve_rods(curves, placed, code, least_radius) for curves in self._curves]
+        parts += [_capsule_rod(capsule, placed, code) for capsule in self._capsules]
+        return Rods(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _to_world(points: Array, prim: Any, placed: Any) -> Array:
+    matrix = np.array(placed.GetLocalToWorldTransform(prim))
+    return points @ matrix[:3, :3] + matrix[3, :3]
+
+
+def _curve_rods(curves: Any, placed: Any, code: float, least_radius: float) -> tuple[Array, ...]:
+    """Pieces of linear or pinned Catmull-Rom curves, whose ends are continued by their mirror image."""
+    points = _to_world(np.array(curves.GetPointsAttr().Get(code), float), curves.GetPrim(), placed)
+    counts = np.array(curves.GetCurveVertexCountsAttr().Get(code))
+    colors = _vertex_colors(curves, counts, code)
+    is_last = np.zeros(len(points), dtype=bool)
+    is_last[np.cumsum(counts) - 1] = True
+    first = np.flatnonzero(~is_last)
+    p1, p2 = points[first], points[first + 1]
+    starts, ends = np.r_[True, is_last[:-1]][first][:, None], is_last[first + 1][:, None]
+    p0 = np.where(starts, 2 * p1 - p2, points[first - 1])
+    p3 = np.where(ends, 2 * p2 - p1, points[np.minimum(first + 2, len(points) - 1)])
+    weights = _LINEAR if curves.GetTypeAttr().Get() == "linear" else _CUBIC
+    knots = np.einsum("kw,wsx->skx", weights, np.stack([p0, p1, p2, p3]))
+    share = np.linspace(0.0, 1.0, len(weights))[:, None]
+    shades = (1 - share) * colors[first][:, None] + share * colors[first + 1][:, None]
+    pieces = len(first) * (len(weights) - 1)
+    radius = max(0.5 * curves.GetWidthsAttr().Get(code)[0], least_radius)
+    ends = (knots[:, :-1], knots[:, 1:], np.full(pieces, radius), shades[:, :-1], shades[:, 1:])
+    return tuple(a.reshape(pieces, 3) if a.ndim == 3 else a for a in ends)
+
+
+def _vertex_colors(curves: Any, counts: NDArray[np.integer], code: float) -> Array:
+    primvar = curves.GetDisplayColorPrimvar()
+    colors = np.array(primvar.Get(code), float)
+    if primvar.GetInterpolation() == "vertex":
+        return colors
+    return np.repeat(colors if primvar.GetInterpolation() == "uniform" else colors[[0] * len(counts)], counts, axis=0)
+
+
+def _capsule_rod(capsule: Any, placed: Any, code: float) -> tuple[Array, ...]:
+    axis = np.eye(3)["XYZ".index(capsule.GetAxisAttr().Get(code))] * 0.5 * capsule.GetHeightAttr().Get(code)
+    start, end = _to_world(np.stack([-axis, axis]), capsule.GetPrim(), placed)
+    color = np.array(capsule.GetDisplayColorAttr().Get(code), float)
+    return start[None], end[None], np.array([capsule.GetRadiusAttr().Get(code)]), color, color
