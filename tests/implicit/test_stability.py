@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from warpflag_kernels.implicit import frozen_flow, stability
+from warpflag_kernels.implicit import stability, step_flow
 
 from tests.bench import Bench, bench, dense_solver
 from tests.helpers import shaken, touching_cell
@@ -28,13 +28,15 @@ def looked(b: Bench, times: int) -> tuple[float, float]:
     """kappa and the over-implicitness chosen, after so many looks at one state."""
     s = b.stepper
     b.factorise(STEP, WEIGHT * GAIN)
-    s._law.gain.fill_(GAIN)
-    frozen_flow.build(b.model, b.state, s._flow)
+    s.law.gain.fill_(GAIN)
+    step_flow.build(b.model, b.state, s.flow)
     for _ in range(times):
         s.data.over_implicit.fill_(WEIGHT)
         s.stability.look.fill_(1)
         s.stability.active.fill_(1)
-        s._measure_stability()
+        stability.measure(
+            b.model, b.state, s.stiffness, s.band, s.flow, s.law.gain, b.increment(), s.stability, s.data.over_implicit
+        )
     return float(s.stability.kappa.numpy()[0]), float(s.data.over_implicit.numpy()[0])
 
 

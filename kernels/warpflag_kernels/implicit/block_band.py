@@ -252,8 +252,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        band: Band,
         # Out:
+        band: Band,  # its work space
         x: Increment,
     ):
         g = wp.tid()

@@ -66,9 +66,7 @@ def struct(p: Precision) -> Any:
         predictor_error: wp.array(
             dtype=real
         )  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
-        predicted_displacement: wp.array(
-            dtype=real
-        )  # [K], lengths of what was predicted for them, summed up [um]
+        predicted_displacement: wp.array(dtype=real)  # [K], lengths of what was predicted for them, summed up [um]
         trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
@@ -115,9 +113,9 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
         # Out:
+        control: Control,
         imp: Implicit,
         band: Band,
         contacts_out: Contacts,
@@ -223,12 +221,12 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        imp: Implicit,
         last: Increment,
         found: Increment,
         predicted: Increment,
         x: Increment,
         # Out:
+        imp: Implicit,
         total: Increment,
         rest: Increment,
         chart: Chart,
@@ -349,11 +347,11 @@ def kernels(p: Precision) -> SimpleNamespace:
     @wp.kernel(module=module)
     def keep_bodies(
         # State:
-        state: State,
         next_last: Increment,
         next_before: Increment,
         imp: Implicit,
         # Out:
+        state: State,
         last: Increment,
         before: Increment,
         control: Control,

@@ -61,18 +61,18 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         state: State,
         share: wp.array(dtype=wp.float64),
         predicted: Increment,
+        contacts_in: Contacts,
         # Out:
-        contacts_out: Contacts,
         law: Law,
     ):
         c, thread = wp.tid()
         if state.active[c] == 0:
             return
-        i = contacts_out.first[c] + thread
-        while i < contacts_out.first[c] + contacts_out.count[c]:
-            gap = contacts_out.gap[i]
+        i = contacts_in.first[c] + thread
+        while i < contacts_in.first[c] + contacts_in.count[c]:
+            gap = contacts_in.gap[i]
             if share[c] > wp.float64(0.0):
-                gap += real(share[c]) * gap_change(model, state, contacts_out, i, predicted)
+                gap += real(share[c]) * gap_change(model, state, contacts_in, i, predicted)
             counted = wp.max(gap, deepest * model.steric.diameter[c])
             law.force[i] = steric_force(counted, model.steric.strength[c], model.steric.diameter[c])
             law.solved_gap[i] = gap
@@ -124,13 +124,13 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         model: Model,
         # State:
         state: State,
-        contacts_in: Contacts,
-        band: Band,
-        flow: Flow,
         start: Increment,
         coarse: real,
         anew: wp.bool,
         # Out:
+        contacts: Contacts,
+        band: Band,
+        flow: Flow,
         law: Law,
         x: Increment,
     ):
@@ -139,16 +139,14 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
             return
         strength = model.steric.strength[c]
         diameter = model.steric.diameter[c]
-        begin = contacts_in.first[c]
-        stop = begin + contacts_in.count[c]
-        capacity = contacts_in.first[c + 1] - begin
+        begin = contacts.first[c]
+        stop = begin + contacts.count[c]
+        capacity = contacts.first[c + 1] - begin
         tolerance = coarse * law.tolerance[c]
         i = begin + thread
         while i < stop:
-            law.diagonal[i] = own_compliance(
-                model, contacts_in, i, stiffening * real(law.gain[c] * band.step[c])
-            )
-            law.free_gap[i] = contacts_in.gap[i] + gap_change(model, state, contacts_in, i, start)
+            law.diagonal[i] = own_compliance(model, contacts, i, stiffening * real(law.gain[c] * band.step[c]))
+            law.free_gap[i] = contacts.gap[i] + gap_change(model, state, contacts, i, start)
             law.applied[i] = real(0.0)
             law.answered[i] = real(0.0)
             i += threads
@@ -181,7 +179,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
                 settle_all(law, begin, stop, strength, diameter, thread)
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
-            worst, loaded = evaluate(model, state, contacts_in, band, flow, law, c, thread, x)
+            worst, loaded = evaluate(model, state, contacts, band, flow, law, c, thread, x)
             if worst <= tolerance or iteration == iterations or not (worst < infinite):
                 going = 0
             else:
@@ -196,7 +194,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         i = begin + thread
         while i < stop:
             law.force[i] = steric_force(law.solved_gap[i], strength, diameter)
-            contacts_in.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
+            contacts.gap[i] = law.solved_gap[i] - law.residual[i]  # where the increment leads
             i += threads
 
     return SimpleNamespace(warm_start=warm_start, solve=solve)
@@ -217,7 +215,7 @@ def warm_start(model: DeviceModel, state: DeviceState, share: Any, predicted: An
 def solve(
     model: DeviceModel,
     state: DeviceState,
-    contacts_in: Any,
+    contacts: Any,
     band: Any,
     flow: Any,
     start: Any,
@@ -237,7 +235,7 @@ def solve(
         anew: whether these contacts are solved for the first time; else with what the last solution told of W.
     """
     threads = model.plan.contact_block
-    inputs = [model.data, state.data, contacts_in, band, flow, start, coarse, anew, law, out]
+    inputs = [model.data, state.data, start, coarse, anew, contacts, band, flow, law, out]
     kernel = _kernels_of(model).solve
     wp.launch(kernel, (model.cell_count, threads), inputs=inputs, device=model.device, block_dim=threads)
 

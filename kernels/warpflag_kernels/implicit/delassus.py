@@ -44,9 +44,7 @@ def struct(p: Precision) -> Any:
         applied: wp.array(dtype=real)  # all that it has been applied to in a solution [pN]
         answered: wp.array(dtype=real)  # and what that has changed [um]
         change: wp.array(dtype=real)  # W load [um]
-        diagonal: wp.array(
-            dtype=real
-        )  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
+        diagonal: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
         share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `diagonal` alone
         wanted: wp.array(dtype=real)  # change of the gap, less what it yields to its own force [um]
         # What is known of W, see `quasi_newton`: loads of unit length, and their answers beyond `diagonal`.

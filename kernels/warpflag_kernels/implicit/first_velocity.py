@@ -25,9 +25,8 @@ def _kernel(p: Precision, pairs: str) -> Any:
     def cells(
         # Model:
         model: Model,
-        # State:
-        flow: Flow,
         # Out:
+        flow: Flow,
         state: State,
     ):
         c = wp.tid()

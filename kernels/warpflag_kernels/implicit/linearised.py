@@ -92,6 +92,11 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
     return SimpleNamespace(load_nodes=load_nodes, add_flows=add_flows, complete=complete)
 
 
+def allocate(model: DeviceModel, state: DeviceState) -> None:
+    """What the state needs for the first variation of forces beside what forces themselves need."""
+    state.data.stretch_change = wp.zeros(model.element_count, dtype=model.precision.vec3, device=model.device)
+
+
 def linearised_terms(model: DeviceModel) -> tuple[Term, ...]:
     """First variations of the model's terms, in their order."""
     return tuple(term.linearised for term in model.terms if term.linearised is not None)

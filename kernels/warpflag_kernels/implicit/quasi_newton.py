@@ -75,9 +75,7 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
             law.loads[at + i] = load
             law.answers[at + i] = law.change[begin + i] - law.diagonal[begin + i] * load
             i += threads
-        size = block_sum(
-            law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread
-        )
+        size = block_sum(law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread)
         m = int(0)
         while m < wp.min(known, kept):
             if m != slot:
@@ -85,9 +83,7 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
                 share = dot(law.loads, at, law.loads, other, law.diagonal, begin, count, thread)
                 remove(law, at, other, block_sum(law, share, c, thread), count, thread)
             m += 1
-        left = block_sum(
-            law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread
-        )
+        left = block_sum(law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread)
         scale = real(0.0)
         if left > same * same * size:
             scale = real(1.0) / wp.sqrt(left)

@@ -70,7 +70,10 @@ def functions(p: Precision) -> SimpleNamespace:
         state.pose.director[e] = director
 
     return SimpleNamespace(
-        body=reconstruct_body, anchor=reconstruct_anchor, node=reconstruct_node, frame=reconstruct_frame
+        reconstruct_body=reconstruct_body,
+        reconstruct_anchor=reconstruct_anchor,
+        reconstruct_node=reconstruct_node,
+        reconstruct_frame=reconstruct_frame,
     )
 
 
@@ -78,8 +81,8 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     f = functions(p)
-    reconstruct_body, reconstruct_anchor = f.body, f.anchor
-    reconstruct_node, reconstruct_frame = f.node, f.frame
+    reconstruct_body, reconstruct_anchor = f.reconstruct_body, f.reconstruct_anchor
+    reconstruct_node, reconstruct_frame = f.reconstruct_node, f.reconstruct_frame
     module = p.module("reconstruction")
 
     @wp.kernel(module=module)

@@ -24,6 +24,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
+from warpflag_kernels.stepping import chebyshev as chebyshev_polynomials
 from warpflag_kernels.stepping import step_control
 from warpflag_kernels.stepping.step_control import StepControl
 
@@ -92,7 +93,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
-    advanced = clock.functions().advanced
+    advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
+    chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
@@ -103,31 +105,16 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
 
-    @wp.func(module=module)
-    def chebyshev(j: wp.int32, theta: wp.float64):
-        """T_j, T_j', T_j'' at cosh(theta)."""
-        n = wp.float64(j)
-        sh = wp.sinh(theta)
-        value = wp.cosh(n * theta)
-        slope = n * wp.sinh(n * theta) / sh
-        return wp.vec3d(value, slope, (n * n * value - wp.cosh(theta) * slope) / (sh * sh))
-
-    @wp.func(module=module)
-    def weight(j: wp.int32, theta: wp.float64):
-        """b_j; b_0 = b_1 = b_2."""
-        c = chebyshev(wp.max(j, 2), theta)
-        return c[2] / (c[1] * c[1])
-
     @wp.kernel(module=module)
     def schedule(
         # Model:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
-        rkc: Rkc,
         # Out:
+        control: Control,
+        rkc: Rkc,
         chart: Chart,
     ):
         c = wp.tid()
@@ -202,8 +189,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        rkc: Rkc,
         # Out:
+        rkc: Rkc,
         chart: Chart,
     ):
         e = wp.tid()
@@ -332,9 +319,9 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
-        state: State,
         chart: Chart,
         # Out:
+        state: State,
         control: Control,
         rkc: Rkc,
     ):
@@ -385,7 +372,7 @@ def begin_pass(
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
-    inputs = [model.data, state.data, control, steps, rkc, chart]
+    inputs = [model.data, state.data, steps, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
@@ -405,5 +392,5 @@ def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Contro
     kernels = _kernels(model.precision, euler)
     inputs = [model.data, state.data, chart, rkc]
     wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
-    inputs = [model.data, state.data, chart, control, rkc]
+    inputs = [model.data, chart, state.data, control, rkc]
     wp.launch(kernels.turn_over, model.cell_count, inputs=inputs, device=model.device)
