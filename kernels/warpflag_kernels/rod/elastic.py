@@ -62,9 +62,9 @@ def functions(p: Precision) -> SimpleNamespace:
         m2 = stiffness * (w2 - rest[1])
         m3 = model.rod.twist_rigidity[k] * per_length * (turned - rest[2])
         common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
-        lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
-        state.joint_before[e] = (common + wp.cross(u, lever)) / state.pose.length[e]
-        state.joint_after[e] = (common - wp.cross(t, lever)) / state.pose.length[e + 1]
+        weighted = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
+        state.joint_before[e] = (common + wp.cross(u, weighted)) / state.pose.length[e]
+        state.joint_after[e] = (common - wp.cross(t, weighted)) / state.pose.length[e + 1]
         state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3
         state.joint_spin_after[e] = real(0.5) * (m1 * wp.dot(kb, b2) - m2 * wp.dot(kb, b1)) + m3
 

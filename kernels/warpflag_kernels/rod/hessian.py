@@ -1,9 +1,9 @@
 """Second derivatives of the elastic energy of every joint and segment.
 
-A joint sees two segment vectors e, f and their spins. With W = m1 w1 + m2 w2 the bending moments' share and S_e, S_f
-the directors weighted by the moments, the closed forms below are those of discrete elastic rods (Bergou 2010),
-written for directors that follow their tangents. They are the symmetric part: the antisymmetric one is half the net
-spin torque of a segment, which its tiny spin drag keeps near zero.
+A joint's energy depends on two segment vectors e, f and their spins. With W = m1 w1 + m2 w2, the sum of bending moments
+times strains, and S_e, S_f the directors weighted by the moments, the closed forms below are those of discrete elastic
+rods (Bergou 2010), written for directors that follow their tangents. They are the symmetric part: the antisymmetric one
+is half the net spin torque of a segment, which its small spin drag keeps near zero.
 """
 
 import functools
