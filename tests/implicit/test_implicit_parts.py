@@ -209,7 +209,7 @@ def test_a_rigid_rotation_of_everything_is_exact_and_strains_nothing(device, pre
     turn, free = rotation(w), np.setdiff1d(np.arange(b.count), b.first)
     # A rigid motion that is carried stays one of the chain: its differences turn along.
     out = b.retract(b.increment(body, nodes), 1.0, b.increment(body, nodes))
-    d, e1 = b.data, np.concatenate(b.start.directors)
+    d, e1 = b.data.pose, np.concatenate(b.start.directors)
     assert close(d.position.numpy(), y @ turn.T, precision)
     assert close(d.director.numpy()[free], e1[free] @ turn.T, precision)
     assert close(out.node.numpy()[free, :3], u + np.cross(w, y[free] @ turn.T), precision)

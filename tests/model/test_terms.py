@@ -148,7 +148,7 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
 
 def kernel_functions(tree: ast.Module) -> list[ast.FunctionDef]:
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    return [f for f in functions if any("kernel" in ast.unparse(d) for d in f.decorator_list)]
+    return [f for f in functions if any("wp.kernel" in ast.unparse(d) for d in f.decorator_list)]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
