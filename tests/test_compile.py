@@ -28,11 +28,19 @@ SWITCHES = {
         "motor.bearing_torque": False,
     },
     "short": {"numerics.pair_precision": "float32"},
+    "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
-VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("rkc", "short"), ("implicit", "none")]
+VARIANTS = [
+    ("rkc", "within"),
+    ("rkc", "between"),
+    ("rkc", "none"),
+    ("rkc", "short"),
+    ("rkc", "external"),
+    ("implicit", "none"),
+]
 
 
 def kernels_in_source() -> set[tuple[str, str]]:

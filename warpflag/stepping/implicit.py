@@ -106,7 +106,7 @@ class ImplicitStepper:
         self._system = system
         model = system.model
         self._smooth_terms = tuple(term for term in model.terms if not term.contact)
-        self._touching = model.switches.touching
+        self._touching = model.touching
         self.history, self._moved_history = History.allocate(model), History.allocate(model)
         self._scratch = Scratch.allocate(model)
         self.stiffness = hessian.allocate(model)

@@ -36,11 +36,6 @@ class Switches:
         """Whether a force term is on."""
         return term in self.terms
 
-    @property
-    def touching(self) -> bool:
-        """Whether anything can be in contact."""
-        return self.has("steric") or self.has("body contact")
-
 
 @dataclass(frozen=True)
 class Plan:

@@ -166,6 +166,11 @@ class DeviceModel:
     def device(self) -> Any:
         return self.plan.device
 
+    @property
+    def touching(self) -> bool:
+        """Whether anything can be in contact."""
+        return any(term.contact for term in self.terms)
+
 
 @dataclass(frozen=True)
 class DeviceState:
