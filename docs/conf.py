@@ -1,0 +1,97 @@
+"""Sphinx configuration: pages in Markdown, API pages from the docstrings.
+
+    uv run --group docs sphinx-build -W -q docs docs/_build
+"""
+
+import re
+
+import warpflag
+
+project = "warpflag"
+author = "the warpflag authors"
+release = version = warpflag.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.apidoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+]
+exclude_patterns = ["_build", "api/*/modules.rst"]
+html_theme = "furo"
+html_title = f"warpflag {release}"
+html_static_path = []
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+# A page per module of both packages. `__init__` modules only gather what their modules define.
+apidoc_automodule_options = {"members", "show-inheritance", "ignore-module-all"}
+apidoc_module_first = True
+apidoc_separate_modules = True
+apidoc_modules = [
+    {"path": path, "destination": f"api/{name}"}
+    for name, path in (("driver", "../warpflag"), ("kernels", "../kernels/warpflag_kernels"))
+]
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+napoleon_custom_sections = [("Errors", "Raises"), "Source"]
+
+_SECTION = re.compile(r"(Args|Returns|Raises|Errors|Attributes|Source|Yields|Example):$")
+
+
+def as_restructured_text(lines: list[str]) -> list[str]:
+    """A docstring, which is plain text with code in backticks, as reStructuredText.
+
+    Characters that would be markup are escaped, code gets its double backticks, and an indented block that no section
+    begins (an equation, a list of commands) becomes a literal block.
+    """
+    out: list[str] = []
+    literal = in_section = False
+    for i, line in enumerate(lines):
+        before = lines[i - 1] if i else ""
+        if line.strip() and not line.startswith(" "):
+            literal, in_section = False, bool(_SECTION.match(line))
+        if line.startswith("    ") and not before.strip() and not in_section and not line.lstrip().startswith("- "):
+            if not literal:
+                out += ["::", ""]
+            literal = True
+        out.append(line if literal else escaped(line))
+    return out
+
+
+def escaped(line: str) -> str:
+    """One line outside a literal block."""
+    parts = re.split(r"(``[^`]*``|:\w+:`[^`]*`|`[^`]*`)", line)
+    for i, part in enumerate(parts):
+        if i % 2 == 0:
+            bullet = re.match(r"\s*- ", part)
+            start = bullet.end() if bullet else 0
+            parts[i] = part[:start] + re.sub(r"([*|\\])|(?<=\w)_(?!\w)", lambda m: "\\" + m.group(0), part[start:])
+        elif part.startswith("`") and not part.startswith("``"):
+            parts[i] = f"`{part}`"
+    return "".join(parts)
+
+
+def escape_docstring(_app: object, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
+    lines[:] = as_restructured_text(lines)
+
+
+def skip_what_is_defined_elsewhere(
+    app: object, what: str, _name: str, member: object, skip: bool, _options: object
+) -> bool | None:
+    """Packages pass on what their modules define; it is documented there, once."""
+    here = app.env.temp_data.get("autodoc:module")  # type: ignore[attr-defined]
+    elsewhere = what == "module" and getattr(member, "__module__", here) != here
+    return True if skip or elsewhere else None
+
+
+def setup(app: object) -> None:
+    # Before napoleon, whose priority is 500.
+    app.connect("autodoc-process-docstring", escape_docstring, priority=400)  # type: ignore[attr-defined]
+    app.connect("autodoc-skip-member", skip_what_is_defined_elsewhere)  # type: ignore[attr-defined]
