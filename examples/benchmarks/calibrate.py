@@ -3,7 +3,7 @@
     uv run examples/benchmarks/calibrate.py --list
     uv run examples/benchmarks/calibrate.py collocation.THETA          one constant, one to three minutes
     uv run examples/benchmarks/calibrate.py collocation.THETA --quick  fewer values and cells, under a minute
-    uv run examples/benchmarks/calibrate.py rkc.estimate               how far the error estimate of RKC is from the error
+    uv run examples/benchmarks/calibrate.py rkc.estimate               RKC's error estimate beside the error
 
 Every value runs in a process of its own, which sets the constant before any kernel is built. The cells are those of
 `WINDOWS`: each begins at a saved state, and its error is the largest displacement of a node at the end from RKC at
@@ -52,12 +52,14 @@ class Window:
         start: simulated time at which it begins [s].
         duration: its length [s].
         repeats: runs of which the least cost counts.
+        torque: of every motor [pN um].
     """
 
     flagella: int
     start: float
     duration: float
     repeats: int
+    torque: float = 3.4
 
 
 WINDOWS = {
@@ -65,10 +67,14 @@ WINDOWS = {
     "contact": Window(2, 5.5e-3, 1.0e-3, 5),  # amid the zipping
     "bundle": Window(2, 8.5e-3, 1.0e-3, 5),  # the flagella lie side by side
     "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, some hundred contacts
+    "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
+    "hard": Window(2, 2.0e-3, 5.0e-4, 3, torque=10.0),  # three times the torque: contacts slam shut, steps are refused
 }
 TWO = ("free", "contact", "bundle")
 TOUCHING = ("contact", "bundle", "crowd")
+ROUGH_GOING = ("hard", "onset", "crowd")
 REFERENCE_STEP = 5.0e-7  # of RKC [s]
+ACCURACIES = (5e-2, 5e-3, 5e-4)  # of RKC [um per ms]
 
 
 @dataclass(frozen=True)
@@ -94,6 +100,7 @@ class Constant:
     package: str = KERNELS
 
 
+FIXED = (("time_step", 1e-5),)
 RKC = (("stepper", "rkc"), ("time_step", 1e-5))
 RKC_SINGLE = (("stepper", "rkc"), ("accuracy", 5e-2), ("precision", "float32"))
 SECOND_ORDER = ("free", "contact", "crowd")
@@ -103,13 +110,13 @@ CONSTANTS = {
     "collocation.THETA": Constant("implicit.collocation", (0.8, 0.72, 0.75, 0.85, 0.9, 1.0), (*TWO, "crowd")),
     "collocation.PEAK": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
     "collocation.GAP_SHARE": Constant("implicit.collocation", (0.35, 0.05, 0.15, 0.7, 1.5, 4.0), TOUCHING),
-    "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING),
-    "step_control.REFUSED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), (*TWO, "crowd")),
+    "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING, FIXED),
+    "step_control.REFUSED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), ROUGH_GOING),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
     "step_control.MEMORY": Constant("stepping.step_control", (5e-4, 2e-5, 1e-4, 2e-3, 1e-2), (*TWO, "crowd")),
-    "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), TOUCHING),
-    "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), (*TWO, "crowd")),
-    "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), (*TWO, "crowd")),
+    "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), ROUGH_GOING),
+    "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), ROUGH_GOING),
+    "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), ROUGH_GOING),
     "stability.LEAST": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.SHARE": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
@@ -117,9 +124,9 @@ CONSTANTS = {
     "stability.FIRST_LOOKS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
     "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), TOUCHING),
-    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), TOUCHING),
-    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), TOUCHING),
-    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), TOUCHING),
+    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), ("hard", *TOUCHING)),
+    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), ("hard", *TOUCHING)),
+    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), ("hard", *TOUCHING)),
     "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), TOUCHING),
     "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), TOUCHING),
     "quasi_newton.KEPT": Constant(
@@ -150,7 +157,8 @@ CONSTANTS = {
 
 def cell(window: str, **numerics: Any) -> Scene:
     """The cell of a window with these settings of `numerics`."""
-    values = {"duration": 1.0, **{f"numerics.{name}": value for name, value in numerics.items()}}
+    values = {"duration": 1.0, "motor.torque": WINDOWS[window].torque}
+    values |= {f"numerics.{name}": value for name, value in numerics.items()}
     if WINDOWS[window].flagella == 8:
         return with_values(load(EIGHT), values)
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
@@ -172,7 +180,8 @@ def start_of(window: str, cache: Path) -> tuple[InitialState, np.ndarray]:
     path = cache / f"{window}-{key}.npz"
     if not path.exists():
         sim = Simulation(approach, device="cpu")
-        sim.advance(w.start)
+        if w.start > 0:
+            sim.advance(w.start)
         start = shape(sim)
         finer = Simulation(exact, device="cpu", starts=start)
         finer.advance(w.duration)
@@ -244,13 +253,20 @@ def table(name: str, windows: list[str], rows: dict[float, dict[str, Any]]) -> s
                 cells += [found["stopped"], "", "", "", ""]
                 continue
             equal = "" if "stopped" in best else f"{found['cost'] * math.sqrt(found['error'] / best['error']):.1f}"
-            cells += [str(found["steps"]), str(found["refused"]), f"{found['cost']:.1f}", f"{found['error']:.1e}", equal]
+            cells += [
+                str(found["steps"]),
+                str(found["refused"]),
+                f"{found['cost']:.1f}",
+                f"{found['error']:.1e}",
+                equal,
+            ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
 def rkc_estimate(cache: Path) -> str:
-    """Of single steps of RKC: the error estimate over the error that the step makes."""
+    """Of single steps of RKC the error estimate over the error that the step makes, and of runs under its control the
+    error at the end over what the accuracy allows."""
     lines = ["| window | step s | estimate um | error um | estimate/error |", "|---|---|---|---|---|"]
     for window in ("free", "contact", "crowd"):
         start, _exact = start_of(window, cache)
@@ -266,12 +282,18 @@ def rkc_estimate(cache: Path) -> str:
             error = np.linalg.norm(sim.cell_state().positions - finer.cell_state().positions, axis=1).max()
             assert int(sim.steps[0]) == 1
             lines.append(f"| {window} | {step:g} | {estimate:.1e} | {error:.1e} | {estimate / error:.1f} |")
+    lines += ["", "| window | accuracy um/ms | steps | error um | error/allowed |", "|---|---|---|---|---|"]
+    for window in ("free", "contact", "crowd"):
+        for accuracy in ACCURACIES:
+            found = measured(window, cache, {"stepper": "rkc", "accuracy": accuracy})
+            share = found["error"] / (accuracy * 1e3 * WINDOWS[window].duration)
+            lines.append(f"| {window} | {accuracy:g} | {found['steps']} | {found['error']:.1e} | {share:.2f} |")
     return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", choices=[[], "all", "rkc.estimate", *CONSTANTS], metavar="CONSTANT")
+    parser.add_argument("names", nargs="*", metavar="CONSTANT", help="names as --list gives them, or all")
     parser.add_argument("--list", action="store_true", help="name the constants that can be measured")
     parser.add_argument("--quick", action="store_true", help="three values, two windows")
     parser.add_argument("--windows", nargs="+", choices=list(WINDOWS), help="instead of the constant's own")
@@ -282,6 +304,8 @@ def main() -> None:
     if args.list or not args.names:
         print("\n".join(["rkc.estimate", *CONSTANTS]))
         return
+    if unknown := set(args.names) - {"all", "rkc.estimate", *CONSTANTS}:
+        parser.error(f"{', '.join(sorted(unknown))}: not a constant of --list")
     if args.probe is not None:
         value = int(args.probe) if isinstance(CONSTANTS[args.names[0]].values[0], int) else args.probe
         print(json.dumps(probe(args.names[0], value, args.windows, args.cache)))
