@@ -3,7 +3,11 @@
 uv run --group docs sphinx-build -W -q docs docs/_build
 """
 
+import ast
 import re
+from pathlib import Path
+
+from sphinx.util import logging
 
 import warpflag
 
@@ -91,7 +95,23 @@ def skip_what_is_defined_elsewhere(
     return True if skip or elsewhere else None
 
 
+def check_constants(_app: object) -> None:
+    """Warns of every named number of the kernels and steppers that numerics.md has no row for."""
+    here = Path(__file__).parent
+    rows = (here / "numerics.md").read_text(encoding="utf-8")
+    files = [*(here / "../kernels/warpflag_kernels").rglob("*.py"), *(here / "../warpflag/stepping").glob("*.py")]
+    for path in sorted(files):
+        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+            targets = statement.targets if isinstance(statement, ast.Assign) else []
+            numeric = any(isinstance(x, ast.Constant) and type(x.value) in (int, float) for x in ast.walk(statement))
+            for name in (t.id for t in targets if isinstance(t, ast.Name)):
+                row = rf"^\|[^|]*\b{name}\b[^|]*\|[^|]*{path.parent.name}/{path.name}"
+                if name.isupper() and numeric and not re.search(row, rows, re.MULTILINE):
+                    logging.getLogger(__name__).warning("numerics.md has no row for %s of %s", name, path.name)
+
+
 def setup(app: object) -> None:
+    app.connect("builder-inited", check_constants)  # type: ignore[attr-defined]
     # Before napoleon, whose priority is 500.
     app.connect("autodoc-process-docstring", escape_docstring, priority=400)  # type: ignore[attr-defined]
     app.connect("autodoc-skip-member", skip_what_is_defined_elsewhere)  # type: ignore[attr-defined]

@@ -52,14 +52,14 @@ class Window:
         start: simulated time at which it begins [s].
         duration: its length [s].
         repeats: runs of which the least cost counts.
-        torque: of every motor [pN um].
+        values: settings beside those of `examples/zipping.toml`, by dotted key.
     """
 
     flagella: int
     start: float
     duration: float
     repeats: int
-    torque: float = 3.4
+    values: tuple[tuple[str, float], ...] = ()
 
 
 WINDOWS = {
@@ -68,10 +68,14 @@ WINDOWS = {
     "bundle": Window(2, 8.5e-3, 1.0e-3, 5),  # the flagella lie side by side
     "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, some hundred contacts
     "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
-    "hard": Window(2, 2.0e-3, 5.0e-4, 3, torque=10.0),  # three times the torque: contacts slam shut, steps are refused
+    # Three times the torque: contacts slam shut, steps are refused.
+    "hard": Window(2, 2.0e-3, 5.0e-4, 3, (("motor.torque", 10.0),)),
+    # A hundred times the steric force.
+    "stiff": Window(2, 5.5e-3, 5.0e-4, 3, (("steric.strength", 80.0),)),
 }
 TWO = ("free", "contact", "bundle")
 TOUCHING = ("contact", "bundle", "crowd")
+LAW = ("stiff", "hard", "contact", "crowd")
 ROUGH_GOING = ("hard", "onset", "crowd")
 REFERENCE_STEP = 5.0e-7  # of RKC [s]
 ACCURACIES = (5e-2, 5e-3, 5e-4)  # of RKC [um per ms]
@@ -123,16 +127,16 @@ CONSTANTS = {
     "stability.MOST": Constant("implicit.stability", (5.0, 2.0, 3.0, 8.0), ("crowd",)),
     "stability.FIRST_LOOKS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
-    "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), TOUCHING),
-    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), ("hard", *TOUCHING)),
-    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), ("hard", *TOUCHING)),
-    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), ("hard", *TOUCHING)),
-    "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), TOUCHING),
-    "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), TOUCHING),
+    "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), LAW),
+    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), LAW),
+    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), LAW),
+    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), LAW),
+    "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), LAW),
+    "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), LAW),
     "quasi_newton.KEPT": Constant(
-        "implicit.quasi_newton", (16, 2, 4, 8, 32), TOUCHING, derived=lambda kept: {"SMALL": kept * (kept + 1)}
+        "implicit.quasi_newton", (16, 2, 4, 8, 32), LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
     ),
-    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), TOUCHING),
+    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), LAW),
     "search.MARGIN": Constant(
         "contact.search", (0.3, 0.05, 0.15, 0.6), TOUCHING, derived=lambda margin: {"REACH": 2 ** (1 / 6) + margin}
     ),
@@ -157,7 +161,7 @@ CONSTANTS = {
 
 def cell(window: str, **numerics: Any) -> Scene:
     """The cell of a window with these settings of `numerics`."""
-    values = {"duration": 1.0, "motor.torque": WINDOWS[window].torque}
+    values = {"duration": 1.0, **dict(WINDOWS[window].values)}
     values |= {f"numerics.{name}": value for name, value in numerics.items()}
     if WINDOWS[window].flagella == 8:
         return with_values(load(EIGHT), values)
