@@ -29,6 +29,8 @@ html_static_path = []
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+# The index has room for tutorials, how-tos and a gallery that are yet to come.
+suppress_warnings = ["toc.empty_glob"]
 
 # A page per module of both packages. `__init__` modules only gather what their modules define.
 apidoc_automodule_options = {"members", "show-inheritance", "ignore-module-all"}

@@ -66,7 +66,7 @@ WINDOWS = {
     "free": Window(2, 2.0e-5, 1.0e-3, 5),  # the flagella are wound up, nothing touches
     "contact": Window(2, 5.5e-3, 1.0e-3, 5),  # amid the zipping
     "bundle": Window(2, 8.5e-3, 1.0e-3, 5),  # the flagella lie side by side
-    "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, some hundred contacts
+    "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, whose contacts are forming
     "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
     # Three times the torque: contacts slam shut, steps are refused.
     "hard": Window(2, 2.0e-3, 5.0e-4, 3, (("motor.torque", 10.0),)),
@@ -75,8 +75,9 @@ WINDOWS = {
 }
 TWO = ("free", "contact", "bundle")
 TOUCHING = ("contact", "bundle", "crowd")
-LAW = ("stiff", "hard", "contact", "crowd")
-ROUGH_GOING = ("hard", "onset", "crowd")
+CONTACT_LAW = ("stiff", "hard", "contact", "crowd")
+EXPLICIT = ("free", "contact", "crowd")
+UPSET = ("hard", "onset", "crowd")
 REFERENCE_STEP = 5.0e-7  # of RKC [s]
 ACCURACIES = (5e-2, 5e-3, 5e-4)  # of RKC [um per ms]
 
@@ -107,7 +108,6 @@ class Constant:
 FIXED = (("time_step", 1e-5),)
 RKC = (("stepper", "rkc"), ("time_step", 1e-5))
 RKC_SINGLE = (("stepper", "rkc"), ("accuracy", 5e-2), ("precision", "float32"))
-SECOND_ORDER = ("free", "contact", "crowd")
 DRIVER = "warpflag"
 
 CONSTANTS = {
@@ -115,28 +115,28 @@ CONSTANTS = {
     "collocation.PEAK": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
     "collocation.GAP_SHARE": Constant("implicit.collocation", (0.35, 0.05, 0.15, 0.7, 1.5, 4.0), TOUCHING),
     "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING, FIXED),
-    "step_control.REFUSED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), ROUGH_GOING),
+    "step_control.REFUSED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), UPSET),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
     "step_control.MEMORY": Constant("stepping.step_control", (5e-4, 2e-5, 1e-4, 2e-3, 1e-2), (*TWO, "crowd")),
-    "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), ROUGH_GOING),
-    "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), ROUGH_GOING),
-    "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), ROUGH_GOING),
+    "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
+    "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), UPSET),
+    "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), UPSET),
     "stability.LEAST": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.SHARE": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
     "stability.MOST": Constant("implicit.stability", (5.0, 2.0, 3.0, 8.0), ("crowd",)),
     "stability.FIRST_LOOKS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
-    "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), LAW),
-    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), LAW),
-    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), LAW),
-    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), LAW),
-    "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), LAW),
-    "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), LAW),
+    "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), CONTACT_LAW),
+    "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), CONTACT_LAW),
+    "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
+    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
+    "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), CONTACT_LAW),
+    "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), CONTACT_LAW),
     "quasi_newton.KEPT": Constant(
-        "implicit.quasi_newton", (16, 2, 4, 8, 32), LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
+        "implicit.quasi_newton", (16, 2, 4, 8, 32), CONTACT_LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
     ),
-    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), LAW),
+    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW),
     "search.MARGIN": Constant(
         "contact.search", (0.3, 0.05, 0.15, 0.6), TOUCHING, derived=lambda margin: {"REACH": 2 ** (1 / 6) + margin}
     ),
@@ -146,10 +146,10 @@ CONSTANTS = {
     "rotne_prager.BLOCK": Constant(
         "fluid.rotne_prager", (64, 16, 32, 128, 256), ("free", "crowd"), (("pair_precision", "float32"),)
     ),
-    "rkc.SAFETY": Constant("stepping.rkc", (1.15, 0.9, 1.0, 1.05, 1.3), SECOND_ORDER, RKC),
-    "rkc.FIRST_PROBES": Constant("stepping.rkc", (40, 2, 5, 10, 80), SECOND_ORDER, RKC),
-    "rkc.PROBE_SIZE": Constant("stepping.rkc", (1e-6, 1e-10, 1e-8, 1e-4, 1e-2), SECOND_ORDER, RKC, key="float64"),
-    "rkc.DAMPING": Constant("stepping.rkc", (2 / 13, 0.02, 0.05, 0.5), SECOND_ORDER, RKC),
+    "rkc.SAFETY": Constant("stepping.rkc", (1.15, 0.9, 1.0, 1.05, 1.3), EXPLICIT, RKC),
+    "rkc.FIRST_PROBES": Constant("stepping.rkc", (40, 2, 5, 10, 80), EXPLICIT, RKC),
+    "rkc.PROBE_SIZE": Constant("stepping.rkc", (1e-6, 1e-10, 1e-8, 1e-4, 1e-2), EXPLICIT, RKC, key="float64"),
+    "rkc.DAMPING": Constant("stepping.rkc", (2 / 13, 0.02, 0.05, 0.5), EXPLICIT, RKC),
     "rkc.NOISE": Constant("stepping.rkc", (20.0, 1.0, 5.0, 80.0), ("free", "contact"), RKC_SINGLE),
     "implicit.ROUGH": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(
@@ -219,15 +219,17 @@ def measured(window: str, cache: Path, numerics: dict[str, Any]) -> dict[str, An
     return {"error": error, "cost": min(costs), "steps": int(sim.steps[0]), "refused": refused}
 
 
-def probe(name: str, value: float, windows: list[str], cache: Path) -> dict[str, Any]:
+def probe(name: str, value: Any, windows: list[str], cache: Path) -> dict[str, Any]:
     """Sets a constant, before any kernel is built, and measures these windows."""
     constant, attribute = CONSTANTS[name], name.partition(".")[2]
     module = importlib.import_module(f"{constant.package}.{constant.module}")
     if not hasattr(module, attribute):
         raise SystemExit(f"{module.__name__} has no constant {attribute}")
+    in_use = getattr(module, attribute)
+    if (in_use[constant.key] if constant.key else in_use) != constant.values[0]:
+        raise SystemExit(f"{module.__name__}.{attribute} is {in_use}, not {constant.values[0]} as in this script")
     if constant.key:
-        value, given = getattr(module, attribute), value
-        value[constant.key] = given
+        value = {**in_use, constant.key: value}
     setattr(module, attribute, value)
     for other, its_value in constant.derived(value).items():
         setattr(module, other, its_value)
