@@ -107,7 +107,7 @@ class Constant:
 
 FIXED = (("time_step", 1e-5),)
 RKC = (("stepper", "rkc"), ("time_step", 1e-5))
-RKC_SINGLE = (("stepper", "rkc"), ("accuracy", 5e-2), ("precision", "float32"))
+SINGLE = (("precision", "float32"),)
 DRIVER = "warpflag"
 
 CONSTANTS = {
@@ -136,7 +136,7 @@ CONSTANTS = {
     "quasi_newton.KEPT": Constant(
         "implicit.quasi_newton", (16, 2, 4, 8, 32), CONTACT_LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
     ),
-    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW),
+    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW, SINGLE),
     "search.MARGIN": Constant(
         "contact.search", (0.3, 0.05, 0.15, 0.6), TOUCHING, derived=lambda margin: {"REACH": 2 ** (1 / 6) + margin}
     ),
@@ -148,9 +148,13 @@ CONSTANTS = {
     ),
     "rkc.SAFETY": Constant("stepping.rkc", (1.15, 0.9, 1.0, 1.05, 1.3), EXPLICIT, RKC),
     "rkc.FIRST_PROBES": Constant("stepping.rkc", (40, 2, 5, 10, 80), EXPLICIT, RKC),
-    "rkc.PROBE_SIZE": Constant("stepping.rkc", (1e-6, 1e-10, 1e-8, 1e-4, 1e-2), EXPLICIT, RKC, key="float64"),
+    "rkc.PROBE_SIZE": Constant(
+        "stepping.rkc", (1e-3, 1e-5, 1e-4, 1e-2, 1e-1), EXPLICIT, (*RKC, *SINGLE), key="float32"
+    ),
     "rkc.DAMPING": Constant("stepping.rkc", (2 / 13, 0.02, 0.05, 0.5), EXPLICIT, RKC),
-    "rkc.NOISE": Constant("stepping.rkc", (20.0, 1.0, 5.0, 80.0), ("free", "contact"), RKC_SINGLE),
+    "rkc.NOISE": Constant(
+        "stepping.rkc", (20.0, 1.0, 5.0, 80.0), ("free", "contact"), (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE)
+    ),
     "implicit.ROUGH": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(
         "stepping.implicit", (3e-5, 1e-5, 2e-5, 5e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 0.5),), package=DRIVER
