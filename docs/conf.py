@@ -1,6 +1,6 @@
 """Sphinx configuration: pages in Markdown, API pages from the docstrings.
 
-uv run --group docs sphinx-build -W -q docs docs/_build
+Built by `uv run --group docs sphinx-build -W -q docs docs/_build`.
 """
 
 import ast
