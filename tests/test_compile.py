@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels.base.types import DeviceModel
+from warpflag_kernels.base.plan import CONTACT_BLOCK
 
 from tests.helpers import cell
+from tests.plans import as_on_gpu, plan
 from warpflag.run.simulation import Simulation
 
 KERNELS = Path(warpflag_kernels.__file__).parent
@@ -55,10 +56,8 @@ def launched(
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
-        if not by_cells:
-            patch.setattr(DeviceModel, "one_thread_per_cell", False)
-            patch.setattr(DeviceModel, "threads_cooperate", True)
-        sim = Simulation(scene, device="cpu")
+        own = plan(scene, "cpu")
+        sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own, CONTACT_BLOCK))
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:
             sim.stepper.stability.due.fill_(1)
