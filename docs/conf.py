@@ -53,20 +53,24 @@ _SECTION = re.compile(r"(Args|Returns|Raises|Errors|Attributes|Source|Yields|Exa
 def as_restructured_text(lines: list[str]) -> list[str]:
     """A docstring, which is plain text with code in backticks, as reStructuredText.
 
-    Characters that would be markup are escaped, code gets its double backticks, and an indented block that no section
-    begins (an equation, a list of commands) becomes a literal block.
+    Characters that would be markup are escaped, code gets its double backticks, and an indented block after a
+    blank line (an equation, a list of functions) becomes a literal block.
     """
     out: list[str] = []
-    literal = in_section = False
+    text = 0  # indentation of the text that a block is indented against: deeper inside a section's entry
+    block = 0  # indentation of the literal block that the line lies in, 0 outside
     for i, line in enumerate(lines):
-        before = lines[i - 1] if i else ""
-        if line.strip() and not line.startswith(" "):
-            literal, in_section = False, bool(_SECTION.match(line))
-        if line.startswith("    ") and not before.strip() and not in_section and not line.lstrip().startswith("- "):
-            if not literal:
-                out += ["::", ""]
-            literal = True
-        out.append(line if literal else escaped(line))
+        indent = len(line) - len(line.lstrip())
+        if line.strip():
+            if indent < block:
+                block = 0
+            if indent == 0:
+                text = 8 if _SECTION.match(line) else 0
+            blank_before = i > 0 and not lines[i - 1].strip()
+            if not block and blank_before and indent >= max(text, 4) and not line.lstrip().startswith("- "):
+                out += [" " * text + "::", ""]
+                block = indent
+        out.append(" " * text + line if block else escaped(line))
     return out
 
 

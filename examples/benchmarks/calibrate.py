@@ -12,7 +12,7 @@ steps of 0.5 us from the same state [um]. Cost is the CPU time per simulated tim
 A larger constant often buys accuracy with cost. So the last column of a window is what the same error would cost: cost
 times the square root of (error over the chosen value's error), since the error of a second-order method goes as the
 step squared and its cost as one over the step. The least number there is the best value, if nothing else speaks
-against it: steps refused, runs stopped by a guard.
+against it: steps rejected, runs stopped by a guard.
 """
 
 from __future__ import annotations
@@ -68,10 +68,12 @@ WINDOWS = {
     "bundle": Window(2, 8.5e-3, 1.0e-3, 5),  # the flagella lie side by side
     "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, whose contacts are forming
     "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
-    # Three times the torque: contacts slam shut, steps are refused.
+    # Three times the torque: contacts slam shut, steps are rejected.
     "hard": Window(2, 2.0e-3, 5.0e-4, 3, (("motor.torque", 10.0),)),
     # A hundred times the steric force.
     "stiff": Window(2, 5.5e-3, 5.0e-4, 3, (("steric.strength", 80.0),)),
+    # A hundred times the stretching stiffness.
+    "taut": Window(2, 5.5e-3, 5.0e-4, 3, (("flagella.stretching_stiffness", 1e5),)),
 }
 TWO = ("free", "contact", "bundle")
 TOUCHING = ("contact", "bundle", "crowd")
@@ -111,23 +113,23 @@ SINGLE = (("precision", "float32"),)
 DRIVER = "warpflag"
 
 CONSTANTS = {
-    "collocation.THETA": Constant("implicit.collocation", (0.8, 0.72, 0.75, 0.85, 0.9, 1.0), (*TWO, "crowd")),
-    "collocation.PEAK": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
+    "collocation.THETA": Constant("implicit.collocation", (0.8, 0.72, 0.75, 0.85, 0.9, 1.0), (*TWO, "crowd", "taut")),
+    "collocation.ERROR_PER_PREDICTOR": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
     "collocation.GAP_SHARE": Constant("implicit.collocation", (0.35, 0.05, 0.15, 0.7, 1.5, 4.0), TOUCHING),
     "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING, FIXED),
-    "step_control.REFUSED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), UPSET),
+    "step_control.REJECTED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), UPSET),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
     "step_control.MEMORY": Constant("stepping.step_control", (5e-4, 2e-5, 1e-4, 2e-3, 1e-2), (*TWO, "crowd")),
     "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
     "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), UPSET),
     "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), UPSET),
     "stability.LEAST": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
-    "stability.SHARE": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
-    "stability.FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
+    "stability.OVER_IMPLICIT_PER_KAPPA": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
+    "stability.LARGEST_FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
     "stability.MOST": Constant("implicit.stability", (5.0, 2.0, 3.0, 8.0), ("crowd",)),
-    "stability.FIRST_LOOKS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
+    "stability.FIRST_MEASUREMENTS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
-    "contact_solve.STIFFENING": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), CONTACT_LAW),
+    "contact_solve.DIAGONAL_PER_DRAG": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), CONTACT_LAW),
     "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), CONTACT_LAW),
     "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
     "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
@@ -136,13 +138,13 @@ CONSTANTS = {
     "quasi_newton.KEPT": Constant(
         "implicit.quasi_newton", (16, 2, 4, 8, 32), CONTACT_LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
     ),
-    "quasi_newton.SAME": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW, SINGLE),
+    "quasi_newton.INDEPENDENT": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW, SINGLE),
     "search.MARGIN": Constant(
         "contact.search", (0.3, 0.05, 0.15, 0.6), TOUCHING, derived=lambda margin: {"REACH": 2 ** (1 / 6) + margin}
     ),
     "contact_list.PER_NODE": Constant("contact.contact_list", (4, 1, 2, 8), ("crowd",)),
     "neighbours.SKIN": Constant("contact.neighbours", (0.1, 0.025, 0.05, 0.2, 0.4), TOUCHING),
-    "frozen_flow.KEPT": Constant("implicit.frozen_flow", (512, 0), ("contact", "crowd")),
+    "plan.STORED_NODES": Constant("base.plan", (512, 0), ("contact", "crowd")),
     "rotne_prager.BLOCK": Constant(
         "fluid.rotne_prager", (64, 16, 32, 128, 256), ("free", "crowd"), (("pair_precision", "float32"),)
     ),
@@ -152,10 +154,13 @@ CONSTANTS = {
         "stepping.rkc", (1e-3, 1e-5, 1e-4, 1e-2, 1e-1), EXPLICIT, (*RKC, *SINGLE), key="float32"
     ),
     "rkc.DAMPING": Constant("stepping.rkc", (2 / 13, 0.02, 0.05, 0.5), EXPLICIT, RKC),
+    "rkc.ESTIMATE_SHARE": Constant(
+        "stepping.rkc", (0.1, 0.01, 0.03, 0.3, 1.0), EXPLICIT, (("stepper", "rkc"), ("accuracy", 5e-3))
+    ),
     "rkc.NOISE": Constant(
         "stepping.rkc", (20.0, 1.0, 5.0, 80.0), ("free", "contact"), (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE)
     ),
-    "implicit.ROUGH": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
+    "implicit.FIRST_TOLERANCE": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(
         "stepping.implicit", (3e-5, 1e-5, 2e-5, 5e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 0.5),), package=DRIVER
     ),
@@ -206,7 +211,7 @@ def start_of(window: str, cache: Path) -> tuple[InitialState, np.ndarray]:
 
 
 def measured(window: str, cache: Path, numerics: dict[str, Any]) -> dict[str, Any]:
-    """Error [um], cost [ms/ms], steps and refused steps of a window; or what stopped the run."""
+    """Error [um], cost [ms/ms], steps and rejected steps of a window; or what stopped the run."""
     start, exact = start_of(window, cache)
     costs = []
     for _ in range(WINDOWS[window].repeats):
@@ -219,8 +224,8 @@ def measured(window: str, cache: Path, numerics: dict[str, Any]) -> dict[str, An
             return {"stopped": f"{stopped.kind.name.lower()} after {1e3 * stopped.time:.2g} ms"}
         costs.append((time.process_time() - begun) / WINDOWS[window].duration)
     error = float(np.linalg.norm(sim.cell_state().positions - exact, axis=1).max())
-    refused = int(sim.stepper.steps.rejected.numpy()[0])
-    return {"error": error, "cost": min(costs), "steps": int(sim.steps[0]), "refused": refused}
+    rejected = int(sim.stepper.steps.rejected.numpy()[0])
+    return {"error": error, "cost": min(costs), "steps": int(sim.steps[0]), "rejected": rejected}
 
 
 def probe(name: str, value: Any, windows: list[str], cache: Path) -> dict[str, Any]:
@@ -252,7 +257,7 @@ def in_process(name: str, value: float, windows: list[str], cache: Path) -> dict
 def table(name: str, windows: list[str], rows: dict[float, dict[str, Any]]) -> str:
     """Rows in the order of the values; the chosen one is marked by an asterisk."""
     chosen = CONSTANTS[name].values[0]
-    columns = ("steps", "refused", "cost ms/ms", "error um", "at equal error")
+    columns = ("steps", "rejected", "cost ms/ms", "error um", "at equal error")
     lines = [f"| {name} | " + " | ".join(f"{w}: {c}" if c == "steps" else c for w in windows for c in columns) + " |"]
     lines.append("|---" * (1 + len(columns) * len(windows)) + "|")
     for value in sorted(rows):
@@ -265,7 +270,7 @@ def table(name: str, windows: list[str], rows: dict[float, dict[str, Any]]) -> s
             equal = "" if "stopped" in best else f"{found['cost'] * math.sqrt(found['error'] / best['error']):.1f}"
             cells += [
                 str(found["steps"]),
-                str(found["refused"]),
+                str(found["rejected"]),
                 f"{found['cost']:.1f}",
                 f"{found['error']:.1e}",
                 equal,
@@ -281,7 +286,7 @@ def rkc_estimate(cache: Path) -> str:
     for window in ("free", "contact", "crowd"):
         start, _exact = start_of(window, cache)
         for step in (5e-6, 1e-5, 2e-5):
-            run = cell(window, stepper="rkc", accuracy=1.0)  # one step is never refused
+            run = cell(window, stepper="rkc", accuracy=1.0)  # one step is never rejected
             sim = Simulation(run, device="cpu", starts=start)
             # The first step of a start is FIRST_STEP unless more is asked for.
             sim.stepper.steps.wanted_step.fill_(step)
