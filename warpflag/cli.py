@@ -193,7 +193,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _check_movie(path: str) -> int:
-    from warpflag.view.usd_check import problems_of
+    from warpflag.view.usd.check import problems_of
 
     found = problems_of(path)
     print("\n".join(found) or f"{path}: plays")

@@ -23,7 +23,7 @@ from warpflag.view.lettering import _GLYPHS, draw_strokes, draw_text, text_width
 from warpflag.view.raycaster import draw
 from warpflag.view.render import Renderer, render
 from warpflag.view.usd import Shot, movie_stage, write_movie
-from warpflag.view.usd_read import Camera, Film, Rods
+from warpflag.view.usd.read import Camera, Film, Rods
 
 RED, BLUE, WHITE = (0.8, 0.05, 0.05), (0.05, 0.05, 0.8), (0.8, 0.8, 0.8)
 LIGHT = (np.array([0.0, 0.6, 0.8]), 0.05)

@@ -14,12 +14,12 @@ from warpflag.base.output import OutputError
 from warpflag.record import RecordError
 from warpflag.record.recorder import Recorder
 from warpflag.scene import Scene, dumps, load, with_values
-from warpflag.view import usd
 from warpflag.view.coloring import QUANTITIES, Coloring
 from warpflag.view.node_quantities import curvature
 from warpflag.view.usd import Shot, movie_stage, write_movie
-from warpflag.view.usd_check import problems
-from warpflag.view.usd_shot import steady_path
+from warpflag.view.usd import movie as usd
+from warpflag.view.usd.camera import steady_path
+from warpflag.view.usd.check import problems
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpflag.view.coloring import linear
-from warpflag.view.usd_read import Camera, Rods
+from warpflag.view.usd.read import Camera, Rods
 
 __all__ = ["draw"]
 

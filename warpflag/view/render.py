@@ -23,7 +23,7 @@ from warpflag.view.images import check_writable, write_animation, write_png
 from warpflag.view.lettering import draw_strokes, draw_text, text_width
 from warpflag.view.raycaster import draw, seen
 from warpflag.view.usd import Shot, movie_stage
-from warpflag.view.usd_read import Film
+from warpflag.view.usd.read import Film
 
 __all__ = ["DISPLAY_RADIUS", "Renderer", "render"]
 

@@ -4,7 +4,7 @@ Units and time: 1 scene unit is 1 um (metersPerUnit 1e-6), z is up, time code = 
 film is slower than the cell by the factor in customLayerData; the simulated time is a custom attribute of the cell.
 
     /World         assembly
-    /World/Cell    what `warpflag.usd_cell` describes; of several records Cell_0, Cell_1, ... side by side
+    /World/Cell    what `warpflag.view.usd.cell` describes; of several records Cell_0, Cell_1, ... side by side
     /World/Camera  holds the whole path in view, or follows the cell
     /World/Lights
 
@@ -31,8 +31,8 @@ from warpflag.base.output import OutputError, whole
 from warpflag.record import Record, RecordError
 from warpflag.scene import loads
 from warpflag.view.coloring import QUANTITIES
-from warpflag.view.usd_cell import Cell
-from warpflag.view.usd_shot import Extent, add_camera, add_lights, arranged, steady_path, view_axes
+from warpflag.view.usd.camera import Extent, add_camera, add_lights, arranged, steady_path, view_axes
+from warpflag.view.usd.cell import Cell
 
 __all__ = ["Shot", "movie_stage", "write_movie"]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.view.usd_read import opened
+from warpflag.view.usd.read import opened
 
 __all__ = ["problems", "problems_of"]
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.coloring import BODY_COLOR, Coloring, linear
-from warpflag.view.usd_shot import Extent, body_axes
+from warpflag.view.usd.camera import Extent, body_axes
 
 __all__ = ["UNDEFINED", "Cell"]
 
