@@ -133,12 +133,12 @@ def _parser() -> argparse.ArgumentParser:
         "export", help="write a record in another format", description="Writes the record of a run in another format."
     )
     export.add_argument("directories", nargs="+", metavar="DIR", help="run directory; several make one USD movie")
-    export.add_argument("--to", choices=("usd", "vtkhdf", "csv"), required=True, help="format")
+    export.add_argument("--to", choices=("usd", "html", "vtkhdf", "csv"), required=True, help="format")
     export.add_argument(
         "-o",
         dest="output",
         metavar="FILE",
-        help="default: movie.usdc, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
+        help="default: movie.usdc, cell.html, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
     )
     export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
     export.set_defaults(command=_export)
@@ -249,9 +249,9 @@ def _export(options: argparse.Namespace) -> int:
     from pathlib import Path
 
     from warpflag.record import Record
-    from warpflag.view import export, usd
+    from warpflag.view import export, page, usd
 
-    names = {"usd": "movie.usdc", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
+    names = {"usd": "movie.usdc", "html": "cell.html", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
     path = Path(options.output or Path(options.directories[0]) / names[options.to])
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
         return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
@@ -260,6 +260,8 @@ def _export(options: argparse.Namespace) -> int:
         if options.to == "usd":
             shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames)
             usd.write_movie(records, path, shot)
+        elif options.to == "html":
+            page.write_page(records[0], path, options.color or "flagellum")
         else:
             {"vtkhdf": export.write_vtkhdf, "csv": export.write_csv}[options.to](records[0], path)
     print(path)

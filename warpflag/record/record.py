@@ -122,6 +122,17 @@ class Record:
         if not self.path.is_file():
             raise RecordError(f"{self.path}: no such record")
 
+    def __repr__(self) -> str:
+        times = self.times
+        until = f" to {1e3 * times[-1]:g} ms" if len(times) else ""
+        return f"Record({str(self.path)!r}: {len(self.first_node) - 1} flagella, {self.frame_count} frames{until})"
+
+    def _repr_html_(self) -> str:
+        """The page of the record in a frame, as a notebook shows it."""
+        from warpflag.view.page import notebook_frame
+
+        return notebook_frame(self)
+
     def __enter__(self) -> Record:
         return self
 

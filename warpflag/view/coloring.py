@@ -15,7 +15,7 @@ from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
 
-__all__ = ["BODY_COLOR", "QUANTITIES", "Coloring", "linear", "map_color"]
+__all__ = ["BODY_COLOR", "FLAGELLUM_COLORS", "QUANTITIES", "UNDEFINED_COLOR", "Coloring", "linear", "map_color"]
 
 QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force")
 
@@ -27,11 +27,15 @@ _PRIMVARS = {
 }
 _LABELS = {"phase_difference": "phase difference", "curvature": "curvature 1/µm", "steric_force": "steric force pN"}
 
-# Okabe & Ito's colours, told apart by colour-blind eyes too, darkest first; repeated beyond seven flagella.
-_FLAGELLUM_COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6fc4")
+# The first seven are Okabe & Ito's, told apart by colour-blind eyes too; the rest are far from them and each other.
+FLAGELLUM_COLORS = (
+    *("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#5b2a86", "#8a1538", "#7d4b1c", "#7fb800", "#00504f", "#4a4a4a"),
+)
+"""Of flagella and runs, sRGB; repeated beyond twelve."""
 # Samples of a map that grows evenly in lightness: dark violet, red, orange, pale yellow.
 _MAP = ("#2b1055", "#5c126e", "#8f2469", "#bf3952", "#e35933", "#f98c0a", "#f9c932", "#fcf4a3")
-_UNDEFINED_COLOR = "#9a9a9a"
+UNDEFINED_COLOR = "#9a9a9a"
 BODY_COLOR = "#dfcfae"
 
 
@@ -116,9 +120,9 @@ class Coloring:
         """Linear RGB of values, shape [..., 3]; grey where they are undefined."""
         values = np.asarray(values, float)
         if self.quantity == "flagellum":
-            table = np.stack([linear(color) for color in _FLAGELLUM_COLORS])
+            table = np.stack([linear(color) for color in FLAGELLUM_COLORS])
             return table[values.astype(int) % len(table)]
         # By a table of 256: decoding each of millions of values would take longer than all the rest.
-        table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(_UNDEFINED_COLOR)])
+        table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(UNDEFINED_COLOR)])
         index = np.where(np.isnan(values), 256, np.clip(255.0 * values / self.highest + 0.5, 0.0, 255.0))
         return table[index.astype(int)]

@@ -24,7 +24,7 @@ def write_vtkhdf(record: Record, path: str | Path) -> None:
     """Writes the flagella as lines over time: a temporal PolyData that ParaView opens without a plugin.
 
     Points have the order of the record's nodes and its precision. Each carries its flagellum, curvature [1/um],
-    phase_difference with the nearest other flagellum and steric_force [pN] (see `warpflag.view.coloring`); each time step
+    phase_difference with the nearest other flagellum and steric_force [pN] (see `Coloring`); each time step
     body_position [um], body_orientation (x, y, z, w), motor_angle [rad] and the observables as field data.
 
     Raises RecordError for a record without frames.

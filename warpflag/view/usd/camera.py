@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Extent", "add_camera", "add_lights", "arranged", "body_axes", "steady_path", "view_axes"]
+from warpflag.view.poses import body_axes
+
+__all__ = ["Extent", "add_camera", "add_lights", "arranged", "steady_path", "view_axes"]
 
 Array = NDArray[np.float64]
 
@@ -23,13 +25,6 @@ _FRAMING_MARGIN = 1.06
 _SIDES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
 _SIDES[:4, 2] = np.repeat(_TANGENTS, 2)
 _ELEVATION = np.radians(12.0)  # the camera looks down a little, so that coils read as coils
-
-
-def body_axes(orientation: NDArray[np.floating]) -> Array:
-    """e_b1, e_b2, e_b3 in the lab as rows, of a quaternion (x, y, z, w)."""
-    x, y, z, w = orientation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return (np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross).T
 
 
 def view_axes(orientation: Array) -> Array:

@@ -22,16 +22,17 @@ from numpy.typing import NDArray
 from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.coloring import BODY_COLOR, Coloring, linear
-from warpflag.view.usd.camera import Extent, body_axes
+from warpflag.view.poses import body_axes, motors
+from warpflag.view.usd.camera import Extent
 
-__all__ = ["UNDEFINED", "Cell"]
+__all__ = ["SPOKE_COLORS", "SPOKE_LENGTHS", "SPOKE_WIDTH", "UNDEFINED", "Cell"]
 
 UNDEFINED = -1.0
 """Raw value of a node at which a quantity is not defined: in a USD file a NaN is a fault."""
 
-_SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
-_SPOKE_WIDTH = 0.07
-_SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
+SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
+SPOKE_WIDTH = 0.07
+SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
 
 
 class Cell:
@@ -154,16 +155,9 @@ class Cell:
         """A motor per flagellum, its tripod at angle 0 set into the body; returns where the angles go."""
         from pxr import Gf, UsdGeom
 
-        record = self._record
-        first = record.first_node[:-1]
-        to_body = body_axes(self._orientations[0])  # rows: the body's axes in the lab
-        anchors = (record.positions[0][first] - self._positions[0]) @ to_body.T
-        e1, axes = record.directors[0][first] @ to_body.T, _motor_axes(self._scene)
         turns = []
-        for k, (anchor, director, axis) in enumerate(zip(anchors, e1, axes, strict=True)):
-            back = self._motor_angles[0, k]  # the angle at the first frame need not be 0
-            director = np.cos(back) * director - np.sin(back) * np.cross(axis, director)
-            tripod = Gf.Matrix3d(*np.stack([director, np.cross(axis, director), axis]).ravel().tolist())
+        for k, (anchor, axes) in enumerate(zip(*motors(self._record, self._scene), strict=True)):
+            tripod = Gf.Matrix3d(*axes.ravel().tolist())
             motor = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Motors/Motor_{k}")
             motor.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*anchor.tolist()))
             motor.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(
@@ -177,16 +171,16 @@ class Cell:
         from pxr import UsdGeom, Vt
 
         points = np.zeros((6, 3), dtype=np.float32)
-        points[1::2] = np.diag(_SPOKE_LENGTHS)
+        points[1::2] = np.diag(SPOKE_LENGTHS)
         motor.CreateTypeAttr(UsdGeom.Tokens.linear)
         motor.CreateCurveVertexCountsAttr([2, 2, 2])
         motor.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        motor.CreateWidthsAttr([_SPOKE_WIDTH])
+        motor.CreateWidthsAttr([SPOKE_WIDTH])
         motor.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        half = 0.5 * _SPOKE_WIDTH
-        extent = np.array([[-half] * 3, np.add(_SPOKE_LENGTHS, half)], dtype=np.float32)
+        half = 0.5 * SPOKE_WIDTH
+        extent = np.array([[-half] * 3, np.add(SPOKE_LENGTHS, half)], dtype=np.float32)
         motor.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
-        colors = np.stack([linear(color) for color in _SPOKE_COLORS])
+        colors = np.stack([linear(color) for color in SPOKE_COLORS])
         motor.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(colors))
         self._bind_material(motor.GetPrim(), "FlagellaMaterial", roughness=0.4)
 
@@ -209,10 +203,3 @@ class Cell:
             output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
             material.CreateSurfaceOutput().ConnectToSource(output)
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
-
-
-def _motor_axes(scene: Scene) -> NDArray[np.float64]:
-    """The motor axes m in body axes, shape [flagellum_count, 3]."""
-    specs = scene.resolved_flagella()
-    angle, around = (np.radians([getattr(spec, name) for spec in specs]) for name in ("motor_axis_angle", "azimuth"))
-    return np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1)
