@@ -98,16 +98,17 @@ def _parser() -> argparse.ArgumentParser:
     plot = commands.add_parser(
         "plot",
         help="draw the curves of runs",
-        description="Draws bundle length, phase difference and contact force of runs over time; needs matplotlib, the "
-        "extra plot. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
+        description="Draws what was measured on a run over time, or compares several runs in phase difference, bundle "
+        "length and contact force; needs matplotlib, the extra plot. Runs are labelled by what differs between their "
+        "scenes. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
     )
     plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory")
     plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
     plot.add_argument(
         "--as",
         dest="kind",
-        choices=("series", "comparison"),
-        help="panels with contact forces, or one of all runs (default: series of one run, comparison of several)",
+        choices=("dashboard", "comparison"),
+        help="all that is known of one run, or several runs side by side (default: by the number of DIR)",
     )
     plot.set_defaults(command=_plot)
 
@@ -208,15 +209,13 @@ def _scene(options: argparse.Namespace) -> Scene:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from pathlib import Path
-
     from warpflag.view import figures
 
-    names = [Path(directory).resolve().name for directory in options.directories]
-    labels = names if len(set(names)) == len(names) else options.directories
-    runs = [figures.read(directory, label) for directory, label in zip(options.directories, labels, strict=True)]
-    comparison = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
-    figures.save(figures.comparison(runs) if comparison else figures.time_series(runs), options.output)
+    runs = [figures.read(directory) for directory in options.directories]
+    compared = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
+    if len(runs) > 1 and not compared:
+        return _say("plot --as dashboard takes one DIR", BAD_INPUT)
+    figures.save(figures.comparison(runs) if compared else figures.dashboard(runs[0]), options.output)
     print(options.output)
     return DONE
 
