@@ -142,6 +142,7 @@ def _parser() -> argparse.ArgumentParser:
         help="default: movie.usdc, cell.html, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
     )
     export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
+    export.add_argument("--mesh", action="store_true", help="a USD movie of meshes, for Blender")
     export.set_defaults(command=_export)
 
     for command in (render, export):
@@ -257,7 +258,7 @@ def _export(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":
-            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames)
+            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames, mesh=options.mesh)
             usd.write_movie(records, path, shot)
         elif options.to == "html":
             page.write_page(records[0], path, options.color or "flagellum")
@@ -267,7 +268,7 @@ def _export(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _shot(options: argparse.Namespace, **more: float | None) -> Shot:
+def _shot(options: argparse.Namespace, **more: float | bool | None) -> Shot:
     """How a movie is to be filmed, by what was said of it."""
     from warpflag.view.usd import Shot
 

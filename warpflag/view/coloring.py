@@ -15,7 +15,16 @@ from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
 
-__all__ = ["BODY_COLOR", "FLAGELLUM_COLORS", "QUANTITIES", "UNDEFINED_COLOR", "Coloring", "linear", "map_color"]
+__all__ = [
+    "BODY_COLOR",
+    "DISPLAY_RADIUS",
+    "FLAGELLUM_COLORS",
+    "QUANTITIES",
+    "UNDEFINED_COLOR",
+    "Coloring",
+    "linear",
+    "map_color",
+]
 
 QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force")
 
@@ -37,6 +46,8 @@ FLAGELLUM_COLORS = (
 _MAP = ("#2b1055", "#5c126e", "#8f2469", "#bf3952", "#e35933", "#f98c0a", "#f9c932", "#fcf4a3")
 UNDEFINED_COLOR = "#9a9a9a"
 BODY_COLOR = "#dfcfae"
+DISPLAY_RADIUS = 0.05
+"""Of the flagella in pictures, pages and meshes, where they are thinner [um]: true to scale they would vanish."""
 
 
 def linear(color: str) -> NDArray[np.float32]:

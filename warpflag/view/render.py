@@ -18,17 +18,15 @@ from warpflag.base.device import find_device
 from warpflag.base.output import OutputError
 from warpflag.base.progress import Progress
 from warpflag.record import Record
-from warpflag.view.coloring import map_color
+from warpflag.view.coloring import DISPLAY_RADIUS, map_color
 from warpflag.view.images import check_writable, write_animation, write_png
 from warpflag.view.lettering import draw_strokes, draw_text, text_width
 from warpflag.view.raycaster import draw, seen
 from warpflag.view.usd import Shot, movie_stage
 from warpflag.view.usd.read import Film
 
-__all__ = ["DISPLAY_RADIUS", "Renderer", "render"]
+__all__ = ["Renderer", "render"]
 
-DISPLAY_RADIUS = 0.05
-"""Of the flagella in pictures, where they are thinner [um]."""
 MOVIE_NAME = "movie.usdc"
 
 _THINNEST = 1.5  # pixels, least radius of a flagellum in a picture

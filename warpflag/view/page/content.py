@@ -10,7 +10,15 @@ import numpy as np
 from warpflag.base.output import OutputError
 from warpflag.record import Record, RecordError
 from warpflag.scene import loads
-from warpflag.view.coloring import BODY_COLOR, FLAGELLUM_COLORS, QUANTITIES, UNDEFINED_COLOR, Coloring, map_color
+from warpflag.view.coloring import (
+    BODY_COLOR,
+    DISPLAY_RADIUS,
+    FLAGELLUM_COLORS,
+    QUANTITIES,
+    UNDEFINED_COLOR,
+    Coloring,
+    map_color,
+)
 from warpflag.view.curves import curves
 from warpflag.view.poses import motors
 from warpflag.view.usd.camera import Extent, steady_path, view_axes
@@ -18,7 +26,6 @@ from warpflag.view.usd.cell import SPOKE_COLORS, SPOKE_LENGTHS, SPOKE_WIDTH
 
 __all__ = ["content"]
 
-DISPLAY_RADIUS = 0.05  # um, of the flagella, where they are thinner: as in pictures
 _UNDEFINED = 255
 _STEPS = 65535
 _BYTES_PER_NODE = 9  # three coordinates and three quantities

@@ -33,6 +33,7 @@ from warpflag.scene import loads
 from warpflag.view.coloring import QUANTITIES
 from warpflag.view.usd.camera import Extent, add_camera, add_lights, arranged, steady_path, view_axes
 from warpflag.view.usd.cell import Cell
+from warpflag.view.usd.mesh_cell import MeshCell
 
 __all__ = ["Shot", "movie_stage", "write_movie"]
 
@@ -40,6 +41,7 @@ SUFFIXES = (".usdc", ".usda", ".usdz")
 _CLIP_BYTES = 1 << 28
 _BLOCK_BYTES = 1 << 21
 _BYTES_PER_NODE = 28  # point, colour and raw value
+_BYTES_PER_MESH_NODE = 16 * (28 + 12)  # two rings of eight vertices, each with its normal
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class Shot:
     frames_per_second: float = 50.0
     slow_down: float | None = None
     clip_frames: int | None = None
+    mesh: bool = False
 
     def __post_init__(self) -> None:
         if self.color_by not in QUANTITIES:
@@ -131,9 +134,10 @@ class _Film:
         self.stage = Usd.Stage.CreateInMemory()
         self._shot = shot
         self._define_world()
+        kind = MeshCell if shot.mesh else Cell
         names = ["Cell"] if len(self.records) == 1 else [f"Cell_{k}" for k in range(len(self.records))]
         cells = zip(names, self.records, scenes, strict=True)
-        self._cells = [Cell(self.stage, f"/World/{name}", *cell, shot.color_by) for name, *cell in cells]
+        self._cells = [kind(self.stage, f"/World/{name}", *cell, shot.color_by) for name, *cell in cells]
         self._view = view_axes(self.records[0].body_orientation[0])
         self._path = self._followed() if shot.follow else np.zeros((self.frame_count, 3))
         self._extents = [Extent(self._view, self._path) for _ in self._cells]
@@ -145,7 +149,8 @@ class _Film:
 
     @property
     def _frame_bytes(self) -> int:
-        return _BYTES_PER_NODE * max(1, sum(int(record.first_node[-1]) for record in self.records))
+        per_node = _BYTES_PER_MESH_NODE if self._shot.mesh else _BYTES_PER_NODE
+        return per_node * max(1, sum(int(record.first_node[-1]) for record in self.records))
 
     def fill(self) -> None:
         """Puts all samples into the stage."""
