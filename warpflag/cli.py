@@ -115,11 +115,13 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser(
         "render",
         help="draw a run as a picture or a film",
-        description="Draws a run or its movie. A .webp or .gif needs Pillow, an .mp4 ffmpeg (extra render). "
+        description="Draws a run or its movie. Letters, .jpg, .webp and .gif need Pillow, .mp4 ffmpeg (extra render). "
         "Flagella are drawn with a radius of 0.05 um; the picture says by how much that is too thick.",
     )
     render.add_argument("source", metavar="DIR", help="run directory, or a .usdc, .usda or .usdz file")
-    render.add_argument("-o", dest="output", metavar="FILE", required=True, help="ends in .png, .webp, .gif or .mp4")
+    render.add_argument(
+        "-o", dest="output", metavar="FILE", required=True, help="ends in .png, .jpg, .webp, .gif or .mp4"
+    )
     render.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="pixels (default: 1280x720)")
     render.add_argument(
         "--times", type=float, nargs="+", default=[], metavar="MS", help="of a picture [ms]; several make a sheet"
@@ -222,6 +224,7 @@ def _plot(options: argparse.Namespace) -> int:
 
 
 def _render(options: argparse.Namespace) -> int:
+    from warpflag.view.notes import can_write
     from warpflag.view.render import render
 
     filmed_anew = options.color or options.follow or options.slow_down
@@ -241,6 +244,8 @@ def _render(options: argparse.Namespace) -> int:
     )
     if not options.quiet:
         print(options.output)
+        if not can_write():
+            _say("drawn without time and scale bar: they need Pillow (pip install 'warpflag[render]')", DONE)
     return DONE
 
 

@@ -91,6 +91,8 @@ class Film:
         self._stage, self._camera, self._light, self._cell = stage, cameras[0], lights[0], cells[0]
         self._curves = [UsdGeom.BasisCurves(prim) for prim in prims if prim.IsA(UsdGeom.BasisCurves)]
         self._capsules = [UsdGeom.Capsule(prim) for prim in prims if prim.IsA(UsdGeom.Capsule)]
+        if not self._curves:
+            raise OutputError(f"{name}: a movie of meshes, which is not drawn here; name the run directory")
         self.start, self.end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
         self.codes_per_second, self.frames_per_second = stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()
         self.facts: dict[str, Any] = dict(stage.GetRootLayer().customLayerData.get("warpflag", {}))
