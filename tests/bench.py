@@ -78,7 +78,7 @@ class Bench:
         wp.launch(k.joint_changes, self.count, inputs=inputs, device=device)
         wp.launch(k.gather_changes, self.count, inputs=inputs, device=device)
         forces, torques = self.data.force.numpy().astype(float), self.data.spin_torque.numpy().astype(float)
-        arms, m = self.data.position.numpy()[self.first], self.data.tangent.numpy()[self.first]
+        arms, m = self.data.pose.position.numpy()[self.first], self.data.pose.tangent.numpy()[self.first]
         on_body = forces[self.first].sum(axis=0)
         torque = np.cross(arms, forces[self.first]).sum(axis=0)
         if self.model.switches.bearing_torque:

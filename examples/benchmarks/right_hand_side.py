@@ -89,7 +89,7 @@ def contact_state(scene: Scene) -> InitialState:
 def native_pair_sum(sim: Simulation, scene: Scene) -> NativePairSum:
     """The C++ sum over the moving nodes of a placed simulation."""
     moving = moving_nodes(sim)
-    forces, positions = sim.system.state.data.force.numpy(), sim.system.state.data.position.numpy()
+    forces, positions = sim.system.state.data.force.numpy(), sim.system.state.data.pose.position.numpy()
     return NativePairSum(positions[moving], forces[moving], pair_radius(scene), scene.numerics.precision)
 
 

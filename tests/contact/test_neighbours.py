@@ -40,13 +40,13 @@ class Cells:
         self.flagellum, self.cell = m.flagellum_of.numpy(), m.cell_of.numpy()
         self.first_node, self.first_flagellum = m.first_node.numpy(), m.first_flagellum.numpy()
         self.segments = np.setdiff1d(np.arange(self.model.element_count), self.first_node)
-        self.start = self.data.position.numpy().astype(np.float64)
+        self.start = self.data.pose.position.numpy().astype(np.float64)
 
     def place(self, x: np.ndarray) -> None:
         lengths = np.linalg.norm(np.diff(x, axis=0, prepend=0.0), axis=1)
         lengths[self.first_node[:-1]] = 1.0
-        self.data.position.assign(x)
-        self.data.length.assign(lengths)
+        self.data.pose.position.assign(x)
+        self.data.pose.length.assign(lengths)
 
     def built_at(self) -> np.ndarray:
         """Positions of the nodes when the lists were built."""
@@ -141,7 +141,7 @@ def test_forces_of_a_random_walk_are_those_without_lists(device, precision):
         for c in range(5):
             own = b.cell == c
             far = np.linalg.norm(x[own] - before[own], axis=1).max()
-            fresh = np.array_equal(now[own], b.data.position.numpy()[own])
+            fresh = np.array_equal(now[own], b.data.pose.position.numpy()[own])
             assert fresh if far > HALF + TOLERANCE[precision] else (now[own] == before[own]).all()
             builds[c] += fresh
         before = now
@@ -160,7 +160,7 @@ def test_only_the_cell_in_which_a_node_has_moved_too_far_is_listed_anew(share, s
         b.place(x)
         neighbours.refresh(b.model, b.state)
         assert list(b.near.stale.numpy()) == [0, stale, 0, 0, 0]
-        fresh = (b.built_at() == b.data.position.numpy()).all(axis=1)
+        fresh = (b.built_at() == b.data.pose.position.numpy()).all(axis=1)
         assert fresh[e] == bool(stale)
         b.place(b.start)
         b.forces()

@@ -96,7 +96,7 @@ def test_search_finds_every_contact_and_nothing_else(values, device, precision):
         found, exact = listed_contacts(b), expected_contacts(b, REACH + 1e-6)
         assert found.keys() <= exact.keys()
         assert all(gap > REACH - 1e-6 for pair, gap in exact.items() if pair not in found)
-        x = b.data.position.numpy().astype(np.float64)
+        x = b.data.pose.position.numpy().astype(np.float64)
         for (e, other), row in found.items():
             assert abs(row["gap"] - exact[e, other]) < 1e-6
             if other >= 0:
@@ -294,13 +294,13 @@ def test_forces_at_contacts_act_on_both_sides_and_on_the_body(name, device, prec
     # With nothing else acting, the body feels what B says, and all of it adds up to nothing.
     b.data.force.assign(added)
     b.data.joint_before.zero_()
-    b.model.data.motor_torque.zero_()
+    b.model.data.motor.torque.zero_()
     body.body_motion(b.model, b.state)
     force, torque = (
         a.numpy().astype(np.float64).sum(axis=0) for a in (b.data.flagellum_force, b.data.flagellum_torque)
     )
     assert close(np.concatenate([force, torque]), (levers @ magnitude)[:6], precision)
-    free, x = np.setdiff1d(np.arange(b.count), b.first), b.data.position.numpy()
+    free, x = np.setdiff1d(np.arange(b.count), b.first), b.data.pose.position.numpy()
     scale = np.abs(added).sum()
     assert np.abs(force + added[free].sum(axis=0)).max() < TOLERANCE[precision] * scale
     assert np.abs(torque + np.cross(x[free], added[free]).sum(axis=0)).max() < TOLERANCE[precision] * scale

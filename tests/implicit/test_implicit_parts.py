@@ -42,9 +42,9 @@ def joint_arrays(b: Bench, nodes: np.ndarray, m: np.ndarray, spins: np.ndarray) 
     t = np.vstack([unit(m), unit(segments)])
     followed = carried(e1, base_t, t)
     followed = followed * np.cos(spins)[:, None] + np.cross(t, followed) * np.sin(spins)[:, None]
-    b.data.tangent.assign(t)
-    b.data.director.assign(followed)
-    b.data.length.assign(np.concatenate([[1.0], np.linalg.norm(segments, axis=1)]))
+    b.data.pose.tangent.assign(t)
+    b.data.pose.director.assign(followed)
+    b.data.pose.length.assign(np.concatenate([[1.0], np.linalg.norm(segments, axis=1)]))
     elastic.joint_gradients(b.model, b.state)
     d = b.data
     found = (d.joint_before, d.joint_after, d.joint_spin_before, d.joint_spin_after)

@@ -93,7 +93,7 @@ def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
     assert variants_of(launches(scene, monkeypatch), "mobility") == {f"{mode}_thread"}
     assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{mode}_steric_body_bearing"}
     model = Simulation(scene, device="cpu").system.model.data
-    assert (model.pair_radius is None) == (mode == "none")
+    assert (model.pairs.radius is None) == (mode == "none")
 
 
 def test_a_single_flagellum_has_no_partner(monkeypatch):

@@ -98,7 +98,7 @@ def test_after_a_jump_of_the_torque_a_restart_begins_small_and_follows(device):
     scene = zipping(implicit(accuracy=5e-3))
     sim = advanced(scene, window("free", device), 1e-4, device)
     usual = sim.system.control.step.numpy()[0]
-    start, torque = reached(sim), sim.system.model.data.motor_torque
+    start, torque = reached(sim), sim.system.model.data.motor.torque
     torque.assign(2.0 * torque.numpy())
     sim.stepper.restart()
     steps, time = sim.steps[0], sim.times[0]
@@ -115,7 +115,7 @@ def test_a_jump_that_nobody_announces_is_noticed(stepper, device):
     """Without a restart: the estimate sees it and steps are rejected, though only a restart keeps the full accuracy."""
     scene = zipping(controlled(stepper, 5e-3))
     sim = advanced(scene, window("free", device), 1e-4, device)
-    start, torque, rejected = reached(sim), sim.system.model.data.motor_torque, counts(sim)[1]
+    start, torque, rejected = reached(sim), sim.system.model.data.motor.torque, counts(sim)[1]
     torque.assign(3.0 * torque.numpy())
     sim.advance(1.5e-4)
     oracle = advanced(with_values(scene, {"motor.torque": 10.2, "numerics.accuracy": 2e-4}), start, 5e-5, device)

@@ -88,7 +88,10 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
         c.elapsed.fill_(1e-5 + shift)
         state.data.active.fill_(1)
         reconstruction.place(model, state, c)
-        return tuple(a.numpy().copy() for a in (state.data.position, state.data.director, state.data.body_position))
+        return tuple(
+            a.numpy().copy()
+            for a in (state.data.pose.position, state.data.pose.director, state.data.pose.body_position)
+        )
 
     rates = np.zeros_like(nodes), np.zeros_like(body)
     _, directors, _ = place(0.0)
@@ -97,7 +100,7 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
     rates = c.rate.numpy().copy(), c.body_rate.numpy().copy()
     s = state.data
     tangents, velocities, spin = s.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
-    spins = model.data.spin_mobility.numpy()[0] * s.spin_torque.numpy()
+    spins = model.data.drag.spin_mobility.numpy()[0] * s.spin_torque.numpy()
     centre_velocity = s.body_velocity.numpy()[0].copy()
     along = np.diff(velocities, axis=0, prepend=0) / s.length.numpy()[:, None]
     along[first] = np.cross(spin, tangents[first])  # the tripod's axis turns with the body
@@ -249,7 +252,7 @@ def test_stage_count_follows_the_stiffness_during_a_run(device):
     scene = cell({"motor.torque": 1.0})
     sim = Simulation(scene, device=device)
     sim.advance(2e-5)
-    hook = sim.system.model.data.hook_rigidity
+    hook = sim.system.model.data.rod.hook_rigidity
     radius, stages = sim.stepper.memory()["spectral_radius"][0], sim.stepper.data.stages.numpy()[0]
     for step in range(24):  # the hook, whose twist is the fastest motion, ten times stiffer by 10 % a step
         hook.assign(hook.numpy() * 1.1)

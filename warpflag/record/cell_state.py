@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,9 @@ class Evaluation:
         torques: on the spins about the tangents [pN um], shape [node_count].
         velocities: of the nodes in the lab [um/s], shape [node_count, 3].
         spins: of the segments about their tangents [rad/s], shape [node_count].
+        tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
+        first: index of r_0 of every flagellum, shape [flagellum_count].
+        supplied: power that motors and forces from outside bring in [pN um/s], by the name of the term.
         body_force, body_torque: on the body, all shares [pN], [pN um], shape [3]; torque about its centre.
         body_velocity, body_spin: of the body [um/s], [rad/s], shape [3].
     """
@@ -57,6 +61,9 @@ class Evaluation:
     torques: np.ndarray
     velocities: np.ndarray
     spins: np.ndarray
+    tangents: np.ndarray
+    first: np.ndarray
+    supplied: Mapping[str, float]
     body_force: np.ndarray
     body_torque: np.ndarray
     body_velocity: np.ndarray

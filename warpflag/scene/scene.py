@@ -17,6 +17,7 @@ from typing import Any
 from warpflag.scene import scene_file
 from warpflag.scene.sections import (
     Body,
+    External,
     Flagella,
     FlagellumOverride,
     Fluid,
@@ -30,6 +31,7 @@ from warpflag.scene.settings import SceneError, Section, Setting, integer, numbe
 
 __all__ = [
     "Body",
+    "External",
     "Flagella",
     "FlagellumOverride",
     "FlagellumSpec",
@@ -92,6 +94,7 @@ class Scene(Section, key=""):
     hydrodynamics: Hydrodynamics = dataclasses.field(default_factory=Hydrodynamics)
     steric: Steric = dataclasses.field(default_factory=Steric)
     body: Body = dataclasses.field(default_factory=Body)
+    external: External = dataclasses.field(default_factory=External)
     numerics: Numerics = dataclasses.field(default_factory=Numerics)
     start: Start = dataclasses.field(default_factory=Start)
 
@@ -192,7 +195,7 @@ def _own(own: Any, group: Any) -> Any:
 
 
 _SECTIONS: dict[str, type[Section]] = {
-    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, Numerics, Start)
+    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
 }
 _KEYS: dict[str, Setting] = {
     f"{cls.key}.{name}".lstrip("."): setting

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.native import native
+from warpflag_kernels.base.precision import Precision
 
 REGISTER = 64  # bytes of the widest vector register
 
@@ -62,41 +63,18 @@ def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, dev
     return found
 
 
-# For group g: BODY with V, a vector of the W lanes, each with the first node and the last row of its flagellum. Nothing
-# of this is for CUDA, but a kernel that could call it must compile there.
-_GROUP = """
-#ifndef __CUDACC__
-    using R = REAL;
-    const int rows = groups.rows.data[g];
-    auto run = [&](auto zero) {
-        using V = decltype(zero);
-        constexpr int W = sizeof(V) / sizeof(R);
-        int flagellum[W], node[W], last[W], shortest = rows;
-        for (int l = 0; l < W; ++l) {
-            flagellum[l] = groups.first.data[g] + (l < groups.count.data[g] ? l : groups.count.data[g] - 1);
-            node[l] = first_node.data[flagellum[l]];
-            last[l] = first_node.data[flagellum[l] + 1] - node[l] - 1;
-            shortest = last[l] + 1 < shortest ? last[l] + 1 : shortest;
-        }
-        auto element = [&](int l, int i) { return node[l] + (i < last[l] ? i : last[l]); };
-        BODY
-    };
-    switch (groups.width.data[g]) { CASES }
-#endif
-"""
-
-
-def code(p: Precision, body: str, words: dict[str, str] | None = None) -> str:
-    """C++ of a function with arguments `groups`, `g` and `first_node`; words: what stands for what in the body.
+def code(p: Precision, body: str) -> str:
+    """C++ of a function with arguments `groups`, `g` and `first_node`, which does `body` for group g.
 
     Loops over r, c, m (rows, columns and more of small blocks) and l (lanes) are unrolled: else the blocks that they
     index would lie in memory.
+
+    Args:
+        p: precision of the lanes.
+        body: C++ in which V is a vector of W lanes.
     """
-    case = "case {0}: {{ typedef R V __attribute__((ext_vector_type({0}))); run(V(R(0))); break; }}"
+    case = "case {0}: {{ typedef Real V __attribute__((ext_vector_type({0}))); run(V(Real(0))); break; }}"
     widest = REGISTER // wp.types.type_size_in_bytes(p.real)
     cases = " ".join(case.format(1 << i) for i in range(widest.bit_length()))
-    name = {"float64": "double", "float32": "float"}[p.name]
-    text = _GROUP.replace("BODY", body)
-    for word, value in {**(words or {}), "CASES": cases, "REAL": name}.items():
-        text = text.replace(word, value)
+    text = native(__file__, "simd_group", p, BODY=body, CASES=cases)
     return re.sub(r"for \(int [rcml] ", r'_Pragma("clang loop unroll(full)") \g<0>', text)

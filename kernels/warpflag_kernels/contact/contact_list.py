@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import chain_chart
 
 PER_NODE = 4  # contacts that a cell has room for (eight bundled flagella have three)
@@ -77,7 +78,8 @@ def functions(p: Precision) -> SimpleNamespace:
         e = contacts_in.segment[i]
         j = contacts_in.other[i]
         if j < 0:
-            return wp.dot(contacts_in.normal[i], shift(x, e) - shift_with_body(x, model.cell_of[e], state.position[e]))
+            beside = shift_with_body(x, model.cell_of[e], state.pose.position[e])
+            return wp.dot(contacts_in.normal[i], shift(x, e) - beside)
         s = contacts_in.at[i]
         r = contacts_in.at_other[i]
         own = s * shift(x, e)
@@ -87,11 +89,11 @@ def functions(p: Precision) -> SimpleNamespace:
             own += (real(1.0) - s) * shift(x, e - 1)
             other += (real(1.0) - r) * shift(x, j - 1)
         else:
-            first = shift_with_body(x, model.cell_of[e], state.position[e - 1])
+            first = shift_with_body(x, model.cell_of[e], state.pose.position[e - 1])
             if anchored == 2:
                 first = shift(x, e - 1)
             own += (real(1.0) - s) * first
-            first = shift_with_body(x, model.cell_of[e], state.position[j - 1])
+            first = shift_with_body(x, model.cell_of[e], state.pose.position[j - 1])
             if anchored == 1:
                 first = shift(x, j - 1)
             other += (real(1.0) - r) * first
@@ -146,10 +148,10 @@ def functions(p: Precision) -> SimpleNamespace:
         model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
     ):
         """What the contact forces of a flagellum put on the body: through its anchor, and as reactions."""
-        load = on_body(on_anchor, state.position[model.first_node[k]])
+        load = on_body(on_anchor, state.pose.position[model.first_node[k]])
         i = contacts_in.body_head[k]
         while i >= 0:
-            load -= on_body(magnitude[i] * contacts_in.normal[i], state.position[contacts_in.segment[i]])
+            load -= on_body(magnitude[i] * contacts_in.normal[i], state.pose.position[contacts_in.segment[i]])
             i = contacts_in.next[i]
         return load
 
@@ -245,10 +247,10 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
     """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
     kernels, inputs = (
-        _kernels(model.precision, model.switches.body_contact),
+        _kernels(model.precision, model.switches.has("body contact")),
         [model.data, contacts, magnitude, state.data],
     )
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.act_on_cells, model.cell_count, inputs=inputs, device=model.device)
     else:
         wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

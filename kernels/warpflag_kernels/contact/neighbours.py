@@ -8,10 +8,13 @@ is the same, in the same order.
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.native import native
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
 CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
 SKIN = 0.1  # [um]
@@ -19,44 +22,54 @@ SLOTS = 64  # segments that a list holds
 SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
 BLOCK = 16  # segments that a CPU asks at once
 
-# Segments [begin, end) of one flagellum that are near (x, y, z), listed in ascending order; returns how many the list
-# then names. A CPU asks a block of them at once: a bit for each that is near. What a block reads beyond `end` is
-# masked, and lies within the arrays, which are a block longer than there are segments.
-_LIST = """
-    const float* __restrict__ X = near.x.data; const float* __restrict__ Y = near.y.data;
-    const float* __restrict__ Z = near.z.data; const float* __restrict__ H = near.half.data;
-    int* S = near.segment.data + list;
-    #ifdef __CUDACC__
-    for (int j = begin; j < end; ++j) {
-        const float dx = x - X[j], dy = y - Y[j], dz = z - Z[j], reach = within + H[j];
-        if (dx * dx + dy * dy + dz * dz < reach * reach) {
-            if (found < SLOTS) S[found] = j;
-            ++found;
-        }
-    }
-    #else
-    for (int b = begin; b < end; b += BLOCK) {
-        unsigned hits = 0;
-        for (int l = 0; l < BLOCK; ++l) {
-            const float dx = x - X[b + l], dy = y - Y[b + l], dz = z - Z[b + l], reach = within + H[b + l];
-            hits |= (unsigned)(dx * dx + dy * dy + dz * dz < reach * reach) << l;
-        }
-        if (end - b < BLOCK) hits &= (1u << (end - b)) - 1u;
-        for (; hits; hits &= hits - 1) {
-            if (found < SLOTS) S[found] = b + __builtin_ctz(hits);
-            ++found;
-        }
-    }
-    #endif
-    return found;
-""".replace("SLOTS", str(SLOTS)).replace("BLOCK", str(BLOCK))
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Neighbours`: a list of near segments for every segment, and where things were when it was built."""
+    real, vec3 = p.real, p.vec3
+
+    @wp.struct
+    class Neighbours:
+        position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
+        left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
+        # When that was last asked; [E + BLOCK] midpoints of segments and half their lengths, a tenth added.
+        x: wp.array(dtype=wp.float32)  # [um]
+        y: wp.array(dtype=wp.float32)
+        z: wp.array(dtype=wp.float32)
+        half: wp.array(dtype=wp.float32)
+        extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
+        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
+        count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
+        earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
+        segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
+
+    return Neighbours
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Neighbours`, with lists that do not hold yet; none without steric forces."""
+    p, near, device = model.precision, struct(model.precision)(), model.device
+    if not model.switches.has("steric"):
+        return near
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    elements, flagella = model.element_count, model.flagellum_count
+    near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
+    near.left, near.stale = zeros(flagella, wp.int32), zeros(model.cell_count, wp.int32)
+    near.x, near.y, near.z, near.half = (zeros(elements + BLOCK, wp.float32) for _ in range(4))
+    near.extent = zeros(flagella, p.real)
+    near.count, near.earlier = zeros(elements, wp.int32), zeros(elements, wp.int32)
+    near.segment = zeros(elements * SLOTS, wp.int32)
+    return near
 
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
     real, vec3 = p.real, p.vec3
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     slots, slack = wp.constant(SLOTS), wp.constant(real(SLACK))
     module = p.module("neighbours_functions")
 
@@ -89,7 +102,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def middle(state: State, e: wp.int32):
-        return real(0.5) * (state.position[e - 1] + state.position[e])
+        return real(0.5) * (state.pose.position[e - 1] + state.pose.position[e])
 
     @wp.func(module=module)
     def next_near(longest: real, j: wp.int32, distance: real, reach: real):
@@ -131,7 +144,7 @@ def functions(p: Precision) -> SimpleNamespace:
 def lists(p: Precision) -> SimpleNamespace:
     """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
     real = p.real
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     middle = functions(p).middle
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
@@ -140,7 +153,7 @@ def lists(p: Precision) -> SimpleNamespace:
     half_share = wp.constant(real(0.55))
     module = p.module("neighbours_functions")
 
-    @wp.func_native(_LIST)
+    @wp.func_native(native(__file__, "near_segments", p, SLOTS=SLOTS, BLOCK=BLOCK))
     def list_some(
         near: Neighbours,
         list: wp.int32,
@@ -159,16 +172,16 @@ def lists(p: Precision) -> SimpleNamespace:
         left = int(0)
         begin = model.first_node[k]
         end = model.first_node[k + 1]
-        centre = state.position[(begin + end) / 2]
+        centre = state.pose.position[(begin + end) / 2]
         widest = real(0.0)
         e = begin
         while e < end:
-            d = state.position[e] - near.position[e]
+            d = state.pose.position[e] - near.position[e]
             if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
                 left = 1
             if e > begin:
                 x = middle(state, e)
-                half = half_share * state.length[e]
+                half = half_share * state.pose.length[e]
                 near.x[e] = wp.float32(x[0])
                 near.y[e] = wp.float32(x[1])
                 near.z[e] = wp.float32(x[2])
@@ -182,11 +195,11 @@ def lists(p: Precision) -> SimpleNamespace:
     def list_near(model: Model, state: State, near: Neighbours, e: wp.int32, c: wp.int32):
         """The list of segment e of cell c."""
         own = model.flagellum_of[e]
-        near.position[e] = state.position[e]
+        near.position[e] = state.pose.position[e]
         found = int(0)
         if e > model.first_node[own]:
             x = middle(state, e)
-            within = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e] + skin
+            within = contact_reach * model.steric.diameter[c] + real(0.5) * state.pose.length[e] + skin
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
                 if k == own:
@@ -194,7 +207,7 @@ def lists(p: Precision) -> SimpleNamespace:
                 else:
                     begin = model.first_node[k]
                     end = model.first_node[k + 1]
-                    away = x - state.position[(begin + end) / 2]
+                    away = x - state.pose.position[(begin + end) / 2]
                     reach = within + near.extent[k]
                     if wp.dot(away, away) < reach * reach:
                         found = list_some(
@@ -225,7 +238,7 @@ def lists(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     has_left, list_near, refresh_cell = lists(p).has_left, lists(p).list_near, lists(p).refresh_cell
     module = p.module("neighbours")
 
@@ -288,7 +301,7 @@ def refresh(model: DeviceModel, state: DeviceState) -> None:
     """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
     kernels, near, device = _kernels(model.precision), state.neighbours, model.device
     inputs = [model.data, state.data, near]
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.refresh_cells, model.cell_count, inputs=inputs, device=device)
         return
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)

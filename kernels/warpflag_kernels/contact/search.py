@@ -11,20 +11,22 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, steric
-from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.contact.constants import CUTOFF
 
 MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
-REACH = steric.CUTOFF + MARGIN  # of what is listed [sigma]
+REACH = CUTOFF + MARGIN  # of what is listed [sigma]
 
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
-    Model, State, Contacts, Pose = structs(p).Model, structs(p).State, contact_list.struct(p), chain_chart.types(p).Pose
-    Neighbours = structs(p).Neighbours
-    nearest, direction = steric.functions(p).nearest, steric.functions(p).direction
+    Model, State, Pose, Contacts = structs(p).Model, structs(p).State, structs(p).Pose, contact_list.struct(p)
+    Neighbours = neighbours.struct(p)
+    law = steric.functions(p)
+    nearest, direction, off_axis = law.nearest, law.direction, law.off_axis
     near_by = neighbours.functions(p)
     candidates, candidate, first_later, beside = (
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
@@ -44,19 +46,13 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         listed.gap[i] = r
         along = pose.position[e] - pose.position[e - 1]
         other = pose.position[j] - pose.position[j - 1]
-        listed.normal[i] = direction(apart, r, along, other, model.steric_diameter[model.cell_of[e]])
-
-    @wp.func(module=module)
-    def off_axis(model: Model, pose: Pose, e: wp.int32, c: wp.int32):
-        """From the nearest point of the body's axis to node e."""
-        axis, half = pose.body_axis[c], model.body_half_length[c]
-        return pose.position[e] - wp.clamp(wp.dot(pose.position[e], axis), -half, half) * axis
+        listed.normal[i] = direction(apart, r, along, other, model.steric.diameter[model.cell_of[e]])
 
     @wp.func(module=module)
     def stands_off(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
         """How a node is in contact i with the body, so far away from its axis."""
         distance = wp.length(away)
-        listed.gap[i] = distance - model.body_radius[c]
+        listed.gap[i] = distance - model.body.radius[c]
         listed.normal[i] = away / distance
 
     @wp.func(module=module)
@@ -75,7 +71,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         those `asked` are looked at, of a longer one's all."""
         k = model.flagellum_of[e]
         c = model.cell_of[e]
-        reach = reach_factor * model.steric_diameter[c]
+        reach = reach_factor * model.steric.diameter[c]
         found = int(0)
         seen = wp.uint64(0)
         q1 = pose.position[e]
@@ -114,7 +110,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 bit = bit << wp.uint64(1)
         if wp.static(body):
             away = off_axis(model, pose, e, c)
-            if wp.length(away) - model.body_radius[c] < reach:
+            if wp.length(away) - model.body.radius[c] < reach:
                 if found < room:
                     i = start + found
                     listed.segment[i] = e
@@ -309,11 +305,11 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
     Args:
         pose: the one that `state` holds.
     """
-    if model.switches.steric:
+    if model.switches.has("steric"):
         neighbours.refresh(model, state)
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs, device = [model.data, state.data, pose, state.neighbours, contacts_out], model.device
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.list_cells, model.cell_count, inputs=inputs, device=device)
         return
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
@@ -324,6 +320,6 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
 
 def renew(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
     """Gaps, directions and levers of the listed contacts in a pose."""
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs = [model.data, state.data, pose, contacts_out]
     wp.launch(kernels.renew, model.element_count, inputs=inputs, device=model.device)

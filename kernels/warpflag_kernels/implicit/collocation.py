@@ -24,8 +24,10 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, Control
-from warpflag_kernels.base.types import Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, structs
 from warpflag_kernels.contact import contact_list
 from warpflag_kernels.implicit import block_band, contact_solve, delassus
 from warpflag_kernels.rod import chain_chart
@@ -61,13 +63,32 @@ def struct(p: Precision) -> Any:
         curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
         one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
-        missed: wp.array(dtype=real)  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
-        predicted: wp.array(dtype=real)  # [K], lengths of the displacements predicted for it, their sum [um]
+        predictor_error: wp.array(
+            dtype=real
+        )  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
+        predicted_displacement: wp.array(
+            dtype=real
+        )  # [K], lengths of what was predicted for them, summed up [um]
         trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
     return Implicit
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Implicit`, zero but for `one`."""
+    p, device = model.precision, model.device
+    i = struct(p)()
+    floats = ("over_implicit", "last_step", "step_before", "ratio", "theta", "ahead", "reach", "curved", "ratio_before")
+    for name in (*floats, "trust"):
+        setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
+    for name in ("history", "accepted", "evaluations"):
+        setattr(i, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
+    for name in ("predictor_error", "predicted_displacement"):
+        setattr(i, name, wp.zeros(model.flagellum_count, dtype=p.real, device=device))
+    i.one = wp.ones(model.cell_count, dtype=wp.float64, device=device)
+    return i
 
 
 @functools.cache
@@ -77,11 +98,12 @@ def kernels(p: Precision) -> SimpleNamespace:
     Chart, Implicit = chart_stage.struct(p), struct(p)
     Band, Contacts = block_band.types(p).Band, contact_list.struct(p)
     Law = delassus.struct(p)
-    _Pose, Increment, vec6 = chain_chart.types(p).Pose, chain_chart.types(p).Increment, chain_chart.types(p).vec6
+    Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     drag = block_band.functions(p).drag
     f = step_control.functions(p, independent=True)
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
-    module = p.module("implicit")
+    advanced = clock.functions().advanced
+    module = p.module("collocation")
     inside, peak = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(PEAK))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
@@ -131,7 +153,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         band.singular[c] = 0
         law.gain[c] = g
         law.failed[c] = 0
-        finest_gap = wp.float64(model.steric_diameter[c]) * finest
+        finest_gap = wp.float64(model.steric.diameter[c]) * finest
         enough = wp.max(gap_share * allowed(steps, c, dt), gap_growth * dt * dt * dt)
         law.tolerance[c] = real(wp.max(finest_gap, enough))
         contacts_out.overflow[c] = 0
@@ -183,7 +205,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         inv_dt = real(wp.float64(1.0) / band.step[c])
         slope = gain * real(imp.ratio[c] / band.step[c])
         gone = slope * last.node[e] + inv_dt * found.node[e]
-        spin = gain * model.spin_mobility[k] * state.spin_torque[e] - gone[3]
+        spin = gain * model.drag.spin_mobility[k] * state.spin_torque[e] - gone[3]
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
@@ -193,7 +215,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             w = state.body_spin[c]
             rate = gain * vec6(u[0], u[1], u[2], w[0], w[1], w[2])
             x.body[c] = rate - slope * last.body[c] - inv_dt * found.body[c]
-        x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+        x.node[e] = vec4(v[0], v[1], v[2], spin / model.drag.spin_mobility[k])
 
     @wp.kernel(module=module)
     def complete(
@@ -220,8 +242,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = real(imp.ratio[c])
         ahead = real(imp.ahead[c])
         whole = real(wp.float64(1.0) / imp.reach[c])
-        missed = real(0.0)
-        foreseen = real(0.0)
+        predictor_error = real(0.0)
+        predicted_displacement = real(0.0)
         e = first
         while e < model.first_node[k + 1]:
             f = found.node[e] + x.node[e]
@@ -231,13 +253,13 @@ def kernels(p: Precision) -> SimpleNamespace:
             total.node[e] = t
             rest.node[e] = t - ahead * last.node[e] - found.node[e]
             if e > first:
-                missed += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-                foreseen += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+                predictor_error += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+                predicted_displacement += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
             e += 1
         if imp.history[c] != 2:
-            missed = real(0.0)
-        imp.missed[k] = whole * missed
-        imp.predicted[k] = whole * foreseen
+            predictor_error = real(0.0)
+        imp.predictor_error[k] = whole * predictor_error
+        imp.predicted_displacement[k] = whole * predicted_displacement
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), total.node[first][3])
         if k == model.first_flagellum[c]:
             b = w * last.body[c] + whole * (found.body[c] + x.body[c])
@@ -272,33 +294,30 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         dt = control.step[c]
-        missed = wp.float64(0.0)
+        predictor_error = wp.float64(0.0)
         k = model.first_flagellum[c]
-        foreseen = wp.float64(0.0)
+        predicted_displacement = wp.float64(0.0)
         nodes = int(0)
         while k < model.first_flagellum[c + 1]:
-            missed += wp.float64(imp.missed[k])
-            foreseen += wp.float64(imp.predicted[k])
+            predictor_error += wp.float64(imp.predictor_error[k])
+            predicted_displacement += wp.float64(imp.predicted_displacement[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
         theta = imp.theta[c]
         truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
-        error = peak * truncated * missed / wp.float64(nodes)
+        error = peak * truncated * predictor_error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
             imp.accepted[c] = 1
             imp.trust[c] = wp.float64(0.0)
-            if missed < foreseen:
-                imp.trust[c] = wp.float64(1.0) - missed / foreseen
+            if predictor_error < predicted_displacement:
+                imp.trust[c] = wp.float64(1.0) - predictor_error / predicted_displacement
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)
             control.steps[c] += 1
-            t = control.time[c] + dt
-            if control.target[c] - t < wp.float64(1.0e-6) * dt:
-                t = control.target[c]
-            control.time[c] = t
+            control.time[c] = advanced(control, c)
             return
         imp.accepted[c] = 0
         chart.commit[c] = 0

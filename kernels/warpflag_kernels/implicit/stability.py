@@ -11,10 +11,12 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
-from warpflag_kernels.implicit import block_band, linearised
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.implicit import linear_system, linearised
 from warpflag_kernels.rod import chain_chart
 
 LEAST = 1.3  # over-implicitness at which one or two flagella are stable
@@ -40,6 +42,22 @@ def struct(p: Precision) -> Any:
         size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part
 
     return Stability
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Stability`; the probe has a share of every mode: random, but the same in every run and
+    every cell."""
+    cells, device = model.cell_count, model.device
+    s = struct(model.precision)()
+    s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
+    s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
+    s.look, s.active = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+    s.due = wp.ones(1, dtype=wp.int32, device=device)  # its kernels load in the first pass, which takes no step
+    nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+    probe = chain_chart.allocate(model)
+    probe.node.assign(np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes]))
+    s.probe = probe
+    return s
 
 
 @functools.cache
@@ -94,7 +112,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         first = model.first_node[k]
         if stability.look[model.cell_of[first]] == 0:
             return
-        scale = real(1.0) / model.segment_length[k]
+        scale = real(1.0) / model.rod.segment_length[k]
         total = wp.float64(0.0)
         e = first
         while e < model.first_node[k + 1]:
@@ -176,7 +194,7 @@ def measure(
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, flow, gain, stability.probe, answer)
-    block_band.solve(model, state, band, answer)
+    linear_system.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, answer, stability, over_implicit, state.data]

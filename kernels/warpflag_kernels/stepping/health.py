@@ -15,8 +15,10 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.clock import STEP_TOLERANCE, Control
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base import clock
+from warpflag_kernels.base.clock import Control
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, search, steric
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
@@ -68,6 +70,18 @@ def struct(p: Precision) -> Any:
     return Guard
 
 
+def allocate(model: DeviceModel, chart: Any) -> Any:
+    """Arrays of the struct `Guard`; the start of the chart counts as checked."""
+    g = struct(model.precision)()
+    g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
+    if model.switches.has("steric"):
+        g.position = wp.clone(chart.base.position)
+        g.longest, g.moved, g.strayed, g.shifted = (
+            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(4)
+        )
+    return g
+
+
 @functools.cache
 def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
@@ -78,23 +92,22 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     near_by = neighbours.functions(p)
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
     beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
-    Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
+    Neighbours, skin = neighbours.struct(p), wp.constant(real(neighbours.SKIN))
     Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
     least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
-    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+    advanced = clock.functions().advanced
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
-    module = p.module("guard", "listing" if listing else "")
+    module = p.module("health", "listing" if listing else "")
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
         if chart.commit[c] == 0:
             return chart.rest[c] != 0  # a start
-        left = control.target[c] - (control.time[c] + control.step[c])
-        ends = left < tolerance * control.step[c]
+        ends = advanced(control, c) >= control.target[c]
         return ends or (control.steps[c] + 1) % guard.interval[c] == 0
 
     @wp.kernel(module=module)
@@ -113,8 +126,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         if state.active[c] == 0 or not due(control, guard, chart, c):
             return
         k = model.flagellum_of[e]
-        x = state.position[e]
-        director = state.director[e]
+        x = state.pose.position[e]
+        director = state.pose.director[e]
         # Normalising turns a director that is not finite into zero.
         directed = wp.dot(director, director) > real(0.5)
         if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e]) and directed):
@@ -122,14 +135,17 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             return
         if e == model.first_node[k] and wp.abs(chart.increment[e][3]) > largest_turn:
             wp.atomic_min(control.fault, c, turned + e)
-        if e > model.first_node[k] and wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
+        if (
+            e > model.first_node[k]
+            and wp.abs(state.pose.length[e] / model.rod.segment_length[k] - real(1.0)) > largest_strain
+        ):
             wp.atomic_min(control.fault, c, strained + e)
         if e + 1 < model.first_node[k + 1]:
-            t = state.tangent[e]
-            u = state.tangent[e + 1]
+            t = state.pose.tangent[e]
+            u = state.pose.tangent[e + 1]
             if real(1.0) + wp.dot(t, u) < smallest_fold:
                 wp.atomic_min(control.fault, c, folded + e)
-            _sine, cosine = twist(t, u, state.director[e], state.director[e + 1])
+            _sine, cosine = twist(t, u, state.pose.director[e], state.pose.director[e + 1])
             if cosine < least_cosine:
                 wp.atomic_min(control.fault, c, twisted + e)
 
@@ -188,13 +204,18 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     def met(state: State, guard: Guard, e: wp.int32, j: wp.int32, moved: real, touch: real):
         """Whether segments e and j have passed through each other since the last look; no node has moved further."""
         away = middle(state, e) - middle(state, j)
-        half = real(0.5) * state.length[j]
-        within = real(0.5) * state.length[e] + half + touch
+        half = real(0.5) * state.pose.length[j]
+        within = real(0.5) * state.pose.length[e] + half + touch
         reach = within + real(2.0) * moved
         if not (wp.dot(away, away) < reach * reach):
             return False
         # No point of one has moved further against a point of the other than their ends have.
-        p1n, q1n, p2n, q2n = state.position[e - 1], state.position[e], state.position[j - 1], state.position[j]
+        p1n, q1n, p2n, q2n = (
+            state.pose.position[e - 1],
+            state.pose.position[e],
+            state.pose.position[j - 1],
+            state.pose.position[j],
+        )
         p1, q1, p2, q2 = guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j]
         dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
         parted = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
@@ -202,7 +223,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         reach = within + parted
         return (
             wp.dot(away, away) < reach * reach
-            and not beside(away, state.tangent[e], state.tangent[j], half, touch + parted)
+            and not beside(away, state.pose.tangent[e], state.pose.tangent[j], half, touch + parted)
             and distance(p1n, q1n - p1n, p2n, q2n - p2n) < touch + parted
             and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch)
         )
@@ -237,16 +258,16 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         k = model.flagellum_of[e]
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
-        touch = real(0.05) * model.steric_diameter[c]
+        touch = real(0.05) * model.steric.diameter[c]
         moved = farthest(model, guard.moved, c)
         # What can have met between the two looks is listed, if nothing has been far from where it was looked for: as a
         # contact, or as a neighbour.
         as_contact = bool(False)
         if wp.static(listing):
             strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
-            as_contact = strayed < listed_reach * model.steric_diameter[c]
+            as_contact = strayed < listed_reach * model.steric.diameter[c]
         shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
-        if as_contact or shifted < contact_reach * model.steric_diameter[c] + skin:
+        if as_contact or shifted < contact_reach * model.steric.diameter[c] + skin:
             i = first_later(model, near, e)
             stop = candidates(model, near, e)
             if as_contact:
@@ -262,7 +283,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
                     wp.atomic_min(control.fault, c, crossing + e)
                 i += 1
             return
-        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
+        reach = real(0.5) * state.pose.length[e] + touch + real(2.0) * moved
         other = k + 1
         while other < model.first_flagellum[c + 1]:
             j = model.first_node[other] + 1
@@ -295,12 +316,12 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         strayed = real(0.0)
         while e < model.first_node[k + 1]:
             if e > model.first_node[k]:
-                longest = wp.max(longest, state.length[e])
-            moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
-            shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
+                longest = wp.max(longest, state.pose.length[e])
+            moved = wp.max(moved, wp.length(state.pose.position[e] - guard.position[e]))
+            shifted = wp.max(shifted, wp.length(state.pose.position[e] - near.position[e]))
             shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
             if wp.static(listing):
-                strayed = wp.max(strayed, wp.length(state.position[e] - listed.position[e]))
+                strayed = wp.max(strayed, wp.length(state.pose.position[e] - listed.position[e]))
                 strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
             e += 1
         guard.longest[k] = longest
@@ -323,7 +344,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0 and due(control, guard, chart, c):
-            guard.position[e] = state.position[e]
+            guard.position[e] = state.pose.position[e]
 
     return SimpleNamespace(
         check_elements=check_elements, check_crossings=check_crossings, measure_moves=measure_moves, remember=remember
@@ -341,7 +362,7 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
     kernels = _kernels(p, listing)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
-    if model.switches.steric:
+    if model.switches.has("steric"):
         found = listed if listing else contact_list.struct(p)()
         moves = [model.data, state.data, state.neighbours, found, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
@@ -351,7 +372,7 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
     """Keeps the checked pose: the next check looks for crossings since then."""
-    if model.switches.steric:
+    if model.switches.has("steric"):
         inputs = [model.data, state.data, control, chart, guard]
         kernel = _kernels(model.precision, False).remember
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

@@ -18,8 +18,10 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, STEP_TOLERANCE, Control
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
 from warpflag_kernels.stepping import step_control
@@ -65,6 +67,24 @@ def struct(p: Precision) -> Any:
     return Rkc
 
 
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Rkc`, zero."""
+    p, device = model.precision, model.device
+    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    r = struct(p)()
+    r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
+    r.body_previous, r.body_before_previous, r.body_start_rate = (zeros(cells, vec6d) for _ in range(3))
+    r.stage, r.stages, r.probes_left, r.evaluations = (zeros(cells, wp.int32) for _ in range(4))
+    r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
+    r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
+    r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
+    return r
+
+
 @functools.cache
 def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
@@ -72,6 +92,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
+    advanced = clock.functions().advanced
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
@@ -241,9 +262,9 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             e += 1
         # Rates carry the round-off of positions times the stiffness of the stretch: below NOISE times the usual an
         # estimate means nothing.
-        reach = real(last - model.first_node[k]) * model.segment_length[k]
-        force = epsilon * reach * model.stretching_stiffness[k] / model.segment_length[k]
-        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.mobility_along[last] * force
+        reach = real(last - model.first_node[k]) * model.rod.segment_length[k]
+        force = epsilon * reach * model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
+        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.drag.mobility_along[last] * force
         rkc.error[k] = worst
 
     @wp.kernel(module=module)
@@ -296,7 +317,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
                 rkc.start_rate[e] = chart.rate[e]
                 e += 1
         elif rkc.stage[c] == 0:
-            scale = real(1.0) / model.segment_length[k]
+            scale = real(1.0) / model.rod.segment_length[k]
             total = wp.float64(0.0)
             while e < end:
                 d = chart.rate[e] - rkc.start_rate[e]
@@ -324,15 +345,10 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         j = rkc.stage[c]
         if chart.rest[c] != 0:
             rkc.body_start_rate[c] = chart.body_rate[c]
-            t = control.time[c]
             if chart.commit[c] != 0:
                 control.steps[c] += 1
-                t += control.step[c]
-                # Steps divide what is left evenly, so the last one ends on the target itself.
-                if control.target[c] - t < tolerance * control.step[c]:
-                    t = control.target[c]
-                control.time[c] = t
-            if t >= control.target[c] or control.fault[c] != no_fault:
+                control.time[c] = advanced(control, c)
+            if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
                 state.active[c] = 0
                 wp.atomic_sub(control.unfinished, 0, 1)
             rkc.stage[c] = wp.static(1 if euler else 0)

@@ -9,11 +9,14 @@ tolerance dt. As good as independent, they add up as the root of it, and one may
 """
 
 import functools
+from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.clock import STEP_TOLERANCE
+from warpflag_kernels.base.precision import Precision
 
 SPAN = 1.0e-3  # over which independent errors add up to what may be made in it [s]
 LARGEST_GROWTH = 2.0  # of the step from one to the next: about where two-step methods cease to be stable
@@ -39,6 +42,22 @@ class StepControl:
     refused_error: wp.array(dtype=wp.float64)  # estimate of the last attempt, if it was refused for it; else 0 [um]
 
 
+def allocate(accuracies: Sequence[float], device: Any) -> StepControl:
+    """The struct `StepControl` of every cell.
+
+    Args:
+        accuracies: node error per simulated time [um/ms], one per cell; 0 for a fixed step.
+        device: Warp's device.
+    """
+    cells, c = len(accuracies), StepControl()
+    c.tolerance = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
+    c.wanted_step, c.error_sum, c.error_time, c.refused_error = (
+        wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
+    )
+    c.rejected = wp.zeros(cells, dtype=wp.int32, device=device)
+    return c
+
+
 @functools.cache
 def functions(p: Precision, independent: bool) -> SimpleNamespace:
     """Device functions of one precision, for errors that are independent from step to step, or alike."""
@@ -50,6 +69,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     refused, safety = wp.constant(wp.float64(REFUSED)), wp.constant(wp.float64(SAFETY))
     forgotten = wp.constant(wp.float64(FORGOTTEN * MEMORY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
+    nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump, shortest = (wp.constant(wp.float64(x)) for x in (JUMP, SHORTEST_STEP))
 
     @wp.func(module=module)
@@ -122,7 +142,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     def next_step(control: StepControl, c: wp.int32, longest: wp.float64, left: wp.float64):
         """The wanted step, shortened so that steps end on the target and none before it is a sliver [s]."""
         dt = wp.min(control.wanted_step[c], longest)
-        if dt > left * wp.float64(0.999999):
+        if dt > left * nearly_all:
             dt = left
         elif dt > wp.float64(0.5) * left:
             dt = wp.float64(0.5) * left

@@ -8,19 +8,20 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import node_velocity
-from warpflag_kernels.implicit import frozen_flow as flow_stage
+from warpflag_kernels.implicit import step_flow as flow_stage
 
 
 @functools.cache
 def _kernel(p: Precision, pairs: str) -> Any:
     Model, State, Flow = structs(p).Model, structs(p).State, flow_stage.struct(p)
-    flows = flow_stage.functions(p, pairs, "kept")
+    flows = flow_stage.functions(p, pairs, "stored")
     drag_velocity = node_velocity.local(p).drag_velocity
     load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
 
-    @wp.kernel(module=p.module("rough_velocities", pairs))
+    @wp.kernel(module=p.module("first_velocity", pairs))
     def cells(
         # Model:
         model: Model,
@@ -55,14 +56,14 @@ def _kernel(p: Precision, pairs: str) -> Any:
 
 def serves(model: DeviceModel) -> bool:
     """Whether the model's coefficients are kept."""
-    return model.switches.pairs != "none" and flow_stage.form_of(model) == "kept"
+    return model.plan.step_pairs == "stored"
 
 
 def node_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
     """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces.
 
     Args:
-        flow: the struct `Flow`, built for this pose; its forces are overwritten.
+        flow: the struct `StepFlow`, built for this pose; its forces are overwritten.
     """
     kernel = _kernel(model.precision, model.switches.pairs)
     wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)
