@@ -123,9 +123,15 @@ class Record:
             raise RecordError(f"{self.path}: no such record")
 
     def __repr__(self) -> str:
-        times = self.times
+        times, count = self.times, len(self.first_node) - 1
         until = f" to {1e3 * times[-1]:g} ms" if len(times) else ""
-        return f"Record({str(self.path)!r}: {len(self.first_node) - 1} flagella, {self.frame_count} frames{until})"
+        return f"<Record {self.path}: {count} flagell{'a' if count > 1 else 'um'}, {self.frame_count} frames{until}>"
+
+    def to_xarray(self) -> Any:
+        """The record as an xarray.Dataset in memory, with named dimensions and units; needs the extra `notebook`."""
+        from warpflag.view.tables import dataset
+
+        return dataset(self)
 
     def _repr_html_(self) -> str:
         """The page of the record in a frame, as a notebook shows it."""

@@ -105,6 +105,12 @@ class Scene(Section, key=""):
         self._check_flagella()
         self._check_phases()
 
+    def _repr_html_(self) -> str:
+        """Tables of the settings, those that differ from the defaults first."""
+        from warpflag.view.scene_table import scene_table
+
+        return scene_table(self)
+
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""
         group = self.flagella
