@@ -51,7 +51,7 @@ DISPLAY_RADIUS = 0.05
 
 
 def linear(color: str) -> NDArray[np.float32]:
-    """Linear RGB of a colour "#rrggbb" in sRGB."""
+    """Linear RGB of a colour "#rrggbb" in sRGB, shape [3]."""
     return _decoded(_srgb(color))
 
 
@@ -73,10 +73,14 @@ def _decoded(srgb: NDArray[np.floating]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Coloring:
-    """How a record's nodes are coloured by one of `QUANTITIES`.
+    """How a record's nodes are coloured by a quantity.
 
-    flagellum: a colour each. phase_difference: `nearest_phase_difference`, 0 to 1. curvature: `curvature`, 0 to
-    twice the intrinsic one. steric_force: `contact_load`, 0 to 8 F_0, a firm contact of two bundled flagella.
+    Attributes:
+        quantity: one of `QUANTITIES`: flagellum, a colour each; phase_difference, `nearest_phase_difference` from 0 to
+            1; curvature, `curvature` from 0 to twice the intrinsic one; steric_force, `contact_load` from 0 to 8 F_0,
+            a firm contact of two bundled flagella.
+        record: the run.
+        scene: of the record.
     """
 
     quantity: str
@@ -85,7 +89,7 @@ class Coloring:
 
     @property
     def primvar(self) -> str:
-        """Name of the primvar with the raw values."""
+        """Name of the USD primvar with the raw values."""
         return _PRIMVARS[self.quantity]
 
     @property
@@ -112,9 +116,11 @@ class Coloring:
         )
 
     def values(self, positions: NDArray[np.floating], frames: slice) -> NDArray[np.floating]:
-        """The quantity at the nodes of a block of frames, shape [frame, node]; of a single row where it never changes.
+        """The quantity at the nodes of a block of frames, shape [frame, node]; a single row where it never changes.
 
-        positions: of these frames [um], shape [frame, node, 3].
+        Args:
+            positions: of these frames [um], shape [frame, node, 3].
+            frames: which they are.
         """
         first_node = self.record.first_node
         if self.quantity == "flagellum":

@@ -21,13 +21,16 @@ _KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 def write_vtkhdf(record: Record, path: str | Path) -> None:
-    """Writes the flagella as lines over time: a temporal PolyData that ParaView opens without a plugin.
+    """Writes the flagella as lines over time; ParaView opens the file without a plugin.
 
+    The file holds a PolyData with time steps.
     Points have the order of the record's nodes and its precision. Each carries its flagellum, curvature [1/um],
     phase_difference with the nearest other flagellum and steric_force [pN] (see `Coloring`); each time step
     body_position [um], body_orientation (x, y, z, w), motor_angle [rad] and the observables as field data.
 
-    Raises RecordError for a record without frames.
+    Raises:
+        RecordError: a record without frames.
+        OSError: the file can't be written.
     """
     import h5py
 
@@ -97,7 +100,9 @@ def write_csv(record: Record, path: str | Path) -> None:
     The first has time, step, body_position_x ..., body_orientation_x ... _w, motor_angle_0 ... and the observables;
     what a frame does not have (a rate in the first) is empty. The second has time, flagellum, node, x, y, z.
 
-    Raises RecordError for a record without frames.
+    Raises:
+        RecordError: a record without frames.
+        OSError: a file can't be written.
     """
     _check_frames(record)
     path = Path(path)
@@ -123,7 +128,7 @@ def write_csv(record: Record, path: str | Path) -> None:
 
 
 def _by_frame(record: Record) -> dict[str, np.ndarray]:
-    """What a frame has one of, by name."""
+    """What is recorded once per frame, not per node, by name; shape [frame] or [frame, ...]."""
     return {
         "body_position": record.body_position,
         "body_orientation": record.body_orientation,
