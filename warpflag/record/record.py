@@ -29,6 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpflag.base.above import method_from
+
 __all__ = ["ENTRIES", "RECORD_NAME", "Frame", "FrameArray", "Record", "RecordError"]
 
 RECORD_NAME = "run.h5"
@@ -127,17 +129,10 @@ class Record:
         until = f" to {1e3 * times[-1]:g} ms" if len(times) else ""
         return f"<Record {self.path}: {count} flagell{'a' if count > 1 else 'um'}, {self.frame_count} frames{until}>"
 
-    def to_xarray(self) -> Any:
-        """The record as an xarray.Dataset in memory, with named dimensions and units; needs the extra `notebook`."""
-        from warpflag.view.tables import dataset
-
-        return dataset(self)
-
-    def _repr_html_(self) -> str:
-        """The page of the record in a frame, as a notebook shows it."""
-        from warpflag.view.page import notebook_frame
-
-        return notebook_frame(self)
+    to_xarray = method_from(
+        "warpflag.view.tables", "dataset", "The record as an xarray.Dataset in memory; needs the extra `notebook`."
+    )
+    _repr_html_ = method_from("warpflag.view.page", "notebook_frame", "The page of the record, as a notebook shows it.")
 
     def __enter__(self) -> Record:
         return self

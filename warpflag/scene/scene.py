@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpflag.base.above import method_from
 from warpflag.scene import scene_file
 from warpflag.scene.sections import (
     Body,
@@ -105,11 +106,7 @@ class Scene(Section, key=""):
         self._check_flagella()
         self._check_phases()
 
-    def _repr_html_(self) -> str:
-        """Tables of the settings, those that differ from the defaults first."""
-        from warpflag.view.scene_table import scene_table
-
-        return scene_table(self)
+    _repr_html_ = method_from("warpflag.view.scene_table", "scene_table", "Tables of the settings, for notebooks.")
 
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""

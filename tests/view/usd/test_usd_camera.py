@@ -7,7 +7,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux  # noqa: TID253 (no command line starts here)
 
 from tests.films import made_record
-from tests.view.stages import at, faults
+from tests.view.usd.stages import at, faults
 from warpflag.scene import Scene, with_values
 from warpflag.view.usd import Shot, movie_stage, write_movie
 from warpflag.view.usd.camera import steady_path

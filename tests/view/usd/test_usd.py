@@ -9,13 +9,13 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdShade  # noqa: TID253 (no command line starts here)
 
 from tests.films import FIRST_NODE, FRAME_INTERVAL, THREE, made_record, motor_axes
-from tests.view.stages import at, faults
+from tests.view.usd.stages import at, faults
 from warpflag.scene import Scene, load, with_values
 from warpflag.view.coloring import QUANTITIES, Coloring
 from warpflag.view.node_quantities import curvature
 from warpflag.view.usd import Shot, movie_stage, write_movie
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
+EXAMPLES = sorted((Path(__file__).parents[3] / "examples").glob("*.toml"))
 
 
 @pytest.fixture(scope="module")

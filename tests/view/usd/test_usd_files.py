@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom  # noqa: TID253 (no command line starts here)
 
 from tests.films import FIRST_NODE, THREE, made_record
-from tests.view.stages import at, faults
+from tests.view.usd.stages import at, faults
 from warpflag.base.output import OutputError
 from warpflag.record import RecordError
 from warpflag.record.recorder import Recorder

@@ -7,7 +7,7 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdShade  # noqa: TID253 (no command line starts here)
 
 from tests.films import FIRST_NODE, made_record
-from tests.view.stages import at, faults
+from tests.view.usd.stages import at, faults
 from warpflag import cli
 from warpflag.base.output import OutputError
 from warpflag.view.coloring import BODY_COLOR, DISPLAY_RADIUS, FLAGELLUM_COLORS, QUANTITIES, linear

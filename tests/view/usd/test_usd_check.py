@@ -6,7 +6,7 @@ import pytest
 from pxr import Gf, Usd  # noqa: TID253 (no command line starts here)
 
 from tests.films import made_record
-from tests.view.stages import at
+from tests.view.usd.stages import at
 from warpflag.view.usd import Shot, write_movie
 from warpflag.view.usd.check import problems
 
