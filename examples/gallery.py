@@ -23,6 +23,24 @@ HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent / "docs"
 TORQUES = (1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)  # pN um
 PAGES = ("zipping", "eight_flagella")  # shown as a page, too
+ENDING = """\
+## How to make your own
+
+| | |
+|---|---|
+| a picture, a sheet, a film | `warpflag render DIR -o cell.png`, `-o sheet.jpg --snapshots 6`, `-o film.webp` |
+| curves of one run, of several | `warpflag plot DIR -o curves.png`, `warpflag plot DIR DIR -o compared.pdf` |
+| a page for a browser | `warpflag export DIR --to html`: one file, which loads nothing from outside |
+| Blender | `warpflag export DIR --to usd --mesh -o movie.usdc`, then `examples/blender.py` |
+| usdview, Omniverse | `movie.usdc` of the run directory, or `warpflag export DIR --to usd --color curvature` |
+| ParaView | `warpflag export DIR --to vtkhdf` |
+| notebooks | `examples/notebooks/`; a record at the end of a cell shows its page |
+
+Pictures are drawn by a ray caster of this package: it needs no display, no GPU and no further package, takes a third of
+a second and draws the same pixels every time, while VTK, which draws without a screen too, weighs more than 500 MB and
+reads no USD. Letters, JPEG, WebP and GIF are Pillow's, mp4 is ffmpeg's, curves are matplotlib's, and the page draws with
+three.js.
+"""
 
 
 @dataclass(frozen=True)
@@ -104,6 +122,7 @@ def main() -> None:
         compared = [ran(name, scene, options.runs) for name, scene in scenes.items()]
         figures.save(figures.comparison(compared), pictures / "torques.png", dpi=110)
         text += ["## Eight torques\n", "![Eight torques](gallery/torques.png)\n"]
+    text.append(ENDING)
     (options.docs / "gallery.md").write_text("\n".join(text), encoding="utf-8")
     print(options.docs / "gallery.md")
 

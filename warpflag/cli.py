@@ -260,6 +260,8 @@ def _export(options: argparse.Namespace) -> int:
     path = Path(options.output or Path(options.directories[0]) / names[options.to])
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
         return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
+    if options.mesh and options.to != "usd":
+        return _say("--mesh is for movies: --to usd", BAD_INPUT)
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":

@@ -153,6 +153,7 @@ def test_the_command_refuses_in_one_line(record, tmp_path, capsys, monkeypatch):
     for arguments, word in (
         (["run", "run", "--to", "csv", "-o", "two.csv"], "several DIR"),
         (["run", "run", "--to", "usd"], "-o"),
+        (["run", "--to", "csv", "--mesh"], "--to usd"),
         (["run", "--to", "usd", "--color", "mood"], "phase_difference"),
         (["run", "--to", "usd", "-o", "movie.avi"], ".usdz"),
     ):

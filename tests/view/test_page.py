@@ -20,6 +20,7 @@ from warpflag.scene import Scene, with_values
 from warpflag.view.coloring import Coloring
 from warpflag.view.page import page_of, write_page
 
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -101,17 +102,17 @@ def test_a_scene_s_text_can_not_break_the_page(tmp_path):
 @pytest.fixture(scope="module")
 def browser():
     """Chromium without a screen; where there is none, these tests are skipped, or fail where they are required."""
-    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     try:
         from playwright.sync_api import sync_playwright
     except ImportError:
-        path = None
-    if path is None:
+        sync_playwright = None
+    if CHROMIUM is None or sync_playwright is None:
+        missing = "needs Chromium (apt-get install chromium) and playwright (uv run --group pages)"
         if os.environ.get("WARPFLAG_REQUIRE_CHROMIUM"):
-            pytest.fail("needs Chromium (apt-get install chromium) and the package playwright")
-        pytest.skip("needs Chromium (apt-get install chromium) and the package playwright")
+            pytest.fail(missing)
+        pytest.skip(missing)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=GRAPHICS)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
         yield browser
         browser.close()
 
@@ -284,6 +285,30 @@ def test_the_page_fits_screens(browser, path, width):
     for box in (opened.page.locator(name).bounding_box() for name in ("#slider", "#play", "#reset")):
         assert box["x"] >= 0 and box["x"] + box["width"] <= width and box["height"] >= 30
     opened.page.close()
+
+
+def test_fingers_work_as_the_mouse_does(browser, path):
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.goto(path.as_uri())
+    plot = page.locator(".plot").last
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    page.touchscreen.tap(box["x"] + box["width"] - 2, box["y"] + 20)
+    assert page.locator("#time").inner_text() == "0.55 ms"
+    page.locator("#play").tap()
+    page.wait_for_function("document.getElementById('slider').value >= 2 && slider.value < 11")
+    context.close()
+
+
+def test_without_webgl_the_curves_work_and_the_page_says_so(browser, path):
+    blind = browser.browser_type.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    page = blind.new_page()
+    page.goto(path.as_uri())
+    assert page.locator("#no-view").is_visible()
+    page.locator("#slider").fill("11")
+    assert page.eval_on_selector(".cursor", "c => c.style.left") == "100%"
+    blind.close()
 
 
 def test_a_record_shows_itself_in_a_notebook(browser, record, tmp_path):

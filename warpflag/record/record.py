@@ -125,7 +125,10 @@ class Record:
             raise RecordError(f"{self.path}: no such record")
 
     def __repr__(self) -> str:
-        times, count = self.times, len(self.first_node) - 1
+        try:
+            times, count = self.times, len(self.first_node) - 1
+        except RecordError:
+            return f"<Record {self.path}: not readable>"
         until = f" to {1e3 * times[-1]:g} ms" if len(times) else ""
         return f"<Record {self.path}: {count} flagell{'a' if count > 1 else 'um'}, {self.frame_count} frames{until}>"
 
