@@ -38,8 +38,8 @@ ENDING = """\
 
 Pictures are drawn by a ray caster of this package: it needs no display, no GPU and no further package, takes a third of
 a second and draws the same pixels every time, while VTK, which draws without a screen too, weighs more than 500 MB and
-reads no USD. Letters, JPEG, WebP and GIF are Pillow's, mp4 is ffmpeg's, curves are matplotlib's, and the page draws with
-three.js.
+reads no USD. Letters, JPEG, WebP and GIF are Pillow's, mp4 is ffmpeg's, curves are matplotlib's, and three.js draws the
+page.
 """
 
 

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,8 +162,9 @@ def render(
     else:
         codes = _snapshot_codes(film, times, snapshots)
     if is_film and not quiet:
-        told = f"{output}: {len(codes)} pictures of {size[0]}x{size[1]}, a film of {len(codes) / rate:.1f} s"
-        print(f"{told}; a picture takes about a second, the first one longer", file=sys.stderr)
+        seconds = len(codes) * _seconds_per_picture(renderer, codes)
+        film_length = f"{len(codes)} pictures of {size[0]}x{size[1]}, a film of {len(codes) / rate:.1f} s"
+        print(f"{output}: {film_length}; drawing it takes about {seconds:.0f} s", file=sys.stderr)
     progress = Progress(film.time(codes[-1]), quiet=quiet or len(codes) == 1)
     try:
         if is_film:
@@ -173,6 +175,14 @@ def render(
             write_picture(output, renderer.picture(codes[0]))
     finally:
         progress.close()
+
+
+def _seconds_per_picture(renderer: Renderer, codes: Sequence[float]) -> float:
+    """Time that a picture takes [s], measured on the last one after the first, which may compile kernels."""
+    renderer.picture(codes[0])
+    start = monotonic()
+    renderer.picture(codes[-1])
+    return monotonic() - start
 
 
 def _snapshot_codes(film: Film, times: Sequence[float], snapshots: int | None) -> list[float]:
