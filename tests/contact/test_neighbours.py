@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from warpflag_kernels.contact import neighbours, search, steric
+import warp as wp
+from warpflag_kernels.contact import neighbours, pair_forces, search
 
 from tests.helpers import cell, touching_cell, unit
 from tests.oracles import CUTOFF, segment_distances
@@ -54,10 +55,10 @@ class Cells:
 
     def forces(self) -> np.ndarray:
         """Contact forces on both nodes of every segment and the sum of their magnitudes, from fresh lists or old."""
-        steric.segment_contact(self.model, self.state)
-        steric.steric_magnitudes(self.model, self.state, self.sim._steric)
-        parts = [self.data.steric_first.numpy(), self.data.steric_second.numpy(), self.sim._steric.numpy()[:, None]]
-        return np.hstack(parts)
+        magnitude = wp.zeros(self.model.element_count, dtype=self.model.precision.real, device=self.model.device)
+        pair_forces.segment_contact(self.model, self.state)
+        pair_forces.steric_magnitudes(self.model, self.state, magnitude)
+        return np.hstack([self.data.steric_first.numpy(), self.data.steric_second.numpy(), magnitude.numpy()[:, None]])
 
     def forces_without_lists(self) -> np.ndarray:
         """The same with every segment asking all others, as one in a crowd does."""

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from tests.helpers import anchors, as_start, cell, displaced, free_nodes, shaken, touching_cell
 from warpflag.model.geometry import InitialState
-from warpflag.model.terms import launch_right_hand_side
 from warpflag.run.simulation import CellState, Simulation
 from warpflag.scene import Scene, with_values
 
@@ -87,11 +87,9 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
         c.body_increment.assign(body + shift * rates[1])
         c.elapsed.fill_(1e-5 + shift)
         state.data.active.fill_(1)
-        reconstruction.place(model, state, c)
-        return tuple(
-            a.numpy().copy()
-            for a in (state.data.pose.position, state.data.pose.director, state.data.pose.body_position)
-        )
+        reconstruction.reconstruct(model, state, c)
+        pose = state.data.pose
+        return tuple(a.numpy().copy() for a in (pose.position, pose.director, pose.body_position))
 
     rates = np.zeros_like(nodes), np.zeros_like(body)
     _, directors, _ = place(0.0)
@@ -99,10 +97,10 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
     comoving_chart.increment_rates(model, state, c)
     rates = c.rate.numpy().copy(), c.body_rate.numpy().copy()
     s = state.data
-    tangents, velocities, spin = s.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
+    tangents, velocities, spin = s.pose.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
     spins = model.data.drag.spin_mobility.numpy()[0] * s.spin_torque.numpy()
     centre_velocity = s.body_velocity.numpy()[0].copy()
-    along = np.diff(velocities, axis=0, prepend=0) / s.length.numpy()[:, None]
+    along = np.diff(velocities, axis=0, prepend=0) / s.pose.length.numpy()[:, None]
     along[first] = np.cross(spin, tangents[first])  # the tripod's axis turns with the body
     turning = np.cross(tangents, along) + spins[:, None] * tangents
     step = 1e-12

@@ -19,6 +19,7 @@ from warpflag_kernels.implicit import (
     delassus,
     first_velocity,
     linear_system,
+    linearised,
     quasi_newton,
     stability,
     step_flow,
@@ -105,7 +106,7 @@ class ImplicitStepper:
         self._system = system
         model = system.model
         self._smooth_terms = tuple(term for term in model.terms if not term.contact)
-        self._touching = model.switches.touching
+        self._touching = model.touching
         self.history, self._moved_history = History.allocate(model), History.allocate(model)
         self._scratch = Scratch.allocate(model)
         self.stiffness = hessian.allocate(model)
@@ -121,9 +122,7 @@ class ImplicitStepper:
         self.stability: Any = None
         if model.switches.pairs != "none" and max(len(s.resolved_flagella()) for s in scenes) > 2:
             self.stability = stability.allocate(model)
-            system.state.data.stretch_change = wp.zeros(
-                model.element_count, dtype=model.precision.vec3, device=model.device
-            )
+            linearised.allocate(model, system.state)
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -133,7 +132,7 @@ class ImplicitStepper:
         model, state, pose, device = s.model, s.state, s.state.data.pose, s.model.device
         last, before = self.history.last, self.history.before
         k = collocation.kernels(model.precision)
-        inputs = [model.data, state.data, s.control, self.steps, i, band, self.contacts, self.law]
+        inputs = [model.data, state.data, self.steps, s.control, i, band, self.contacts, self.law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         # The first iteration, where the last steps lead.
         inputs = [model.data, state.data, i, last, before, x.predicted]
@@ -156,8 +155,8 @@ class ImplicitStepper:
             search.renew(model, state, pose, self.contacts)
         self._evaluate()
         solution = self._solve(x.last_at_second, x.found, first=False)
-        inputs = [model.data, state.data, i, x.last_at_second, x.found, x.expected, solution]
-        inputs += [x.total, x.remaining, s.chart]
+        inputs = [model.data, state.data, x.last_at_second, x.found, x.expected, solution]
+        inputs += [i, x.total, x.remaining, s.chart]
         wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
         moved = self._moved_history
         transported = (x.total, x.last_at_second, moved.last, moved.before)
@@ -173,7 +172,7 @@ class ImplicitStepper:
         if self.stability is not None:
             stability.schedule(model, state, i.evaluations, i.accepted, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)
-        inputs = [state.data, moved.last, moved.before, i, last, before, s.control]
+        inputs = [moved.last, moved.before, i, state.data, last, before, s.control]
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
         clock.count_pass(s.control, device)
 

@@ -32,7 +32,7 @@ def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
     c.error_sum.zero_()
     c.error_time.zero_()
-    c.refused_error.zero_()
+    c.rejected_error.zero_()
     c.wanted_step.assign(np.where(c.tolerance.numpy() > 0.0, FIRST_STEP, fixed_start))
 
 

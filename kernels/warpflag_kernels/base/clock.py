@@ -28,7 +28,7 @@ class Control:
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
     at_rest: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
-    budget: wp.array(dtype=wp.int32)  # [1], passes left before the host looks again
+    budget: wp.array(dtype=wp.int32)  # [1], passes left before the host reads the clocks
     proceed: wp.array(dtype=wp.int32)  # [1], the loop condition
 
 

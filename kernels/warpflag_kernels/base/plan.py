@@ -36,11 +36,6 @@ class Switches:
         """Whether a force term is on."""
         return term in self.terms
 
-    @property
-    def touching(self) -> bool:
-        """Whether anything can be in contact."""
-        return self.has("steric") or self.has("body contact")
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -106,10 +101,12 @@ class Plan:
         build = "strict build" if self.precision.strict else "fast build"
         pairs = "" if self.pair_precision == self.precision else f" with pairs in {self.pair_precision.name}"
         launch = "one launch per right-hand side" if self.by_cells else "a launch per stage"
-        sums = {"none": "no pair sum"}.get(self.pair_sum, f"{self.pair_sum} pair sum{pairs}")
+        sums = "local drag alone"
+        if self.pair_sum != "none":
+            sums = f"{self.pair_sum} pair sum{pairs}, {self.step_pairs} within an implicit step"
         block = "one thread" if self.contact_block == 1 else f"blocks of {self.contact_block} threads"
-        forms = f"{launch}, {sums}, {self.step_pairs} pairs within a step, {self.chains} chains"
-        return f"{self.device.alias}, {self.precision.name}, {build}: {forms}, contacts by {block}"
+        forms = f"{launch}, {sums}, {self.chains} chains, contacts by {block}"
+        return f"{self.device.alias}, {self.precision.name}, {build}: {forms}"
 
 
 def choose_plan(device: Any, precision: Precision, switches: Switches, largest_cell: int) -> Plan:

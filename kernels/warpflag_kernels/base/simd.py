@@ -1,11 +1,10 @@
-"""Flagella of a cell side by side, one per lane of a vector register: how a CPU takes what goes row after row.
+"""SIMD over flagella: recursions along a chain, for several flagella of a cell in the lanes of a vector register.
 
-Along one flagellum every row waits for the one before; the same rows of several flagella do not wait for each other. A
-group is what fills a register: flagella of one cell. A lane that is left over repeats the last flagellum of its group,
-and so finds the same; what a lane finds beyond the end of its flagellum is not to be kept.
+Along one flagellum every row of a recursion depends on the one before; the same rows of several flagella are
+independent. A group is as many flagella of one cell as fill a register. A lane without a flagellum of its own repeats
+the last one of its group, with the same result; what a lane computes beyond the end of its flagellum is not stored.
 
-Clang's vector types are what makes vector code of this, hence C++. A strict build takes flagella one by one, as a GPU
-does.
+Clang's vector types express this, hence C++. A strict build takes flagella one by one, as a GPU does.
 """
 
 import functools
@@ -41,11 +40,13 @@ def struct() -> Any:
 
 
 def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, device: Any) -> Any:
-    """Groups of a batch.
+    """The struct `Groups` of a batch.
 
     Args:
+        p: precision, which sets the number of lanes.
         first_flagellum: first flagellum of every cell and their number, shape [cell_count + 1].
         first_node: first node of every flagellum and their number, shape [flagellum_count + 1].
+        device: Warp's device.
     """
     widest, length = REGISTER // wp.types.type_size_in_bytes(p.real), np.diff(first_node)
     first_group, start, groups = [0], [0], []

@@ -125,7 +125,7 @@ def structs(p: Precision) -> SimpleNamespace:
         steric_second: wp.array(dtype=vec3)  # [E] [pN]
         body_contact: wp.array(dtype=vec3)  # [E] [pN]
         # Totals.
-        force: wp.array(dtype=vec3)  # [E]; on r_0: what the anchor hands to the body [pN]
+        force: wp.array(dtype=vec3)  # [E]; on r_0: force of the flagellum on the body at the anchor [pN]
         spin_torque: wp.array(dtype=real)  # [E], about the tangent [pN um]
         velocity: wp.array(dtype=vec3)  # [E], of the node, lab [um/s]
         flagellum_force: wp.array(dtype=vec3)  # [K], of a flagellum on the body [pN]
@@ -165,6 +165,11 @@ class DeviceModel:
     @property
     def device(self) -> Any:
         return self.plan.device
+
+    @property
+    def touching(self) -> bool:
+        """Whether anything can be in contact."""
+        return any(term.contact for term in self.terms)
 
 
 @dataclass(frozen=True)

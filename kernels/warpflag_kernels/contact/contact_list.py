@@ -1,8 +1,8 @@
-"""Contacts of an implicit step: the list of pairs that may touch, and the levers through which their forces act.
+"""Contacts of an implicit step: the list of pairs that may touch, and products with their contact Jacobian B.
 
-A contact that closes inside a step has no stiffness before it, so linearising its force across the step would let it
-pass. The step instead treats the gaps of all pairs that may close as unknowns and solves the force law exactly in
-their space; `contact_search` finds them.
+A contact that closes during a step has no stiffness at its beginning, so a force linearised there would let the
+filaments pass through each other. The step instead takes the gaps of all pairs that may close as unknowns and solves
+the exact force law for them. `search` fills the list.
 """
 
 import functools
@@ -16,7 +16,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import chain_chart
 
-PER_NODE = 4  # contacts that a cell has room for (eight bundled flagella have three)
+PER_NODE = 4  # contacts per node that a cell has room for; eight bundled flagella have three
 
 
 @functools.cache
@@ -28,7 +28,7 @@ def struct(p: Precision) -> Any:
     class Contacts:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
-        position: wp.array(dtype=vec3)  # [E], of the nodes where contacts were looked for [um]
+        position: wp.array(dtype=vec3)  # [E], of the nodes at the last search [um]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
         found: wp.array(dtype=wp.uint64)  # [E], which neighbours of a segment are contacts, a bit each
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
@@ -49,7 +49,7 @@ def struct(p: Precision) -> Any:
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of B: what forces at the contacts act on, and how an increment changes a gap."""
+    """Device functions of the contact Jacobian: loads of contact forces on nodes and body, changes of a gap."""
     real, vec3, vec6 = p.real, p.vec3, chain_chart.types(p).vec6
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
     Increment = chain_chart.types(p).Increment
@@ -68,13 +68,13 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def shift_with_body(x: Increment, c: wp.int32, y: vec3):
-        """How an increment moves a point y of the body."""
+        """Displacement of a point y of the body under an increment [um]."""
         b = x.body[c]
         return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), y)
 
     @wp.func(module=module)
     def gap_change(model: Model, state: State, contacts_in: Contacts, i: wp.int32, x: Increment):
-        """B^T x of contact i: how an increment changes its gap."""
+        """B^T x of contact i: the change of its gap under an increment [um]."""
         e = contacts_in.segment[i]
         j = contacts_in.other[i]
         if j < 0:
@@ -101,8 +101,8 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def segment_loads(contacts_in: Contacts, magnitude: wp.array(dtype=real), e: wp.int32):
-        """Contact forces on the first and second node of segment e >= 1; the second also takes its node's with the
-        body."""
+        """Contact forces on the first and second node of segment e >= 1; a contact of node e with the body acts on the
+        second."""
         on_first = vec3(real(0.0))
         on_second = vec3(real(0.0))
         i = contacts_in.start[e]
@@ -147,7 +147,7 @@ def functions(p: Precision) -> SimpleNamespace:
     def body_load(
         model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
     ):
-        """What the contact forces of a flagellum put on the body: through its anchor, and as reactions."""
+        """Force and torque of a flagellum's contacts on the body: through its anchor, and as reactions."""
         load = on_body(on_anchor, state.pose.position[model.first_node[k]])
         i = contacts_in.body_head[k]
         while i >= 0:
@@ -222,7 +222,7 @@ def _kernels(p: Precision, body: bool) -> SimpleNamespace:
 
 
 def allocate(model: DeviceModel, touching: bool) -> Any:
-    """Arrays of the struct `Contacts`; next to none where nothing can touch."""
+    """Arrays of the struct `Contacts`; room for one contact a cell where nothing can touch."""
     p, device = model.precision, model.device
     nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
     first = np.concatenate([[0], np.cumsum(PER_NODE * nodes if touching else np.ones_like(nodes))])

@@ -1,6 +1,6 @@
-// Segments [begin, end) of one flagellum that are near (x, y, z), listed in ascending order; returns how many the list
-// then names. A CPU asks a block of them at once: a bit for each that is near. What a block reads beyond `end` is masked,
-// and lies within the arrays, which are a block longer than there are segments.
+// Lists the segments [begin, end) of one flagellum that are near (x, y, z), in ascending order; returns the length of the
+// list. A CPU tests a block of them at once: a bit for each that is near. What a block reads beyond `end` is masked, and
+// lies within the arrays, which are a block longer than there are segments.
 const float* __restrict__ X = near.x.data; const float* __restrict__ Y = near.y.data;
 const float* __restrict__ Z = near.z.data; const float* __restrict__ H = near.half.data;
 int* S = near.segment.data + list;

@@ -1,9 +1,9 @@
-"""Near segments of other flagella: a list per segment that holds until something has moved by half its skin.
+"""Verlet lists: for every segment, the near segments of other flagella, valid until a node has moved by half the skin.
 
-Contact, its search for a step and the guard against crossings all ask which segments are close. A list that is a
-skin longer than the reach answers for many passes: it is built anew only when some node of the cell has moved by more
-than half the skin since. A segment in a crowd larger than its list asks all segments instead; either way the answer
-is the same, in the same order.
+The steric force, the contact search of a step and the guard against crossings all need to know which segments are
+close. A list with a reach longer by the skin serves many passes: it is rebuilt only when some node of the cell has
+moved by more than half the skin since. A segment with more neighbours than its list has room for tests all segments
+instead; either way the result is the same, in the same order.
 """
 
 import functools
@@ -16,11 +16,13 @@ from warpflag_kernels.base.native import native
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
-CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
-SKIN = 0.1  # [um]
-SLOTS = 64  # segments that a list holds
-SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
-BLOCK = 16  # segments that a CPU asks at once
+CONTACT_REACH = (
+    1.5  # reach of the lists without the skin [sigma]: the cutoff 1.122 plus the search's margin, rounded up
+)
+SKIN = 0.1  # [um]; at 6 mm/s, the fastest tips, a list serves 8 us
+SLOTS = 64  # room of a list, and bits of the mask in which a search marks its contacts
+SLACK = 1.1  # a segment is at most this times the longest one at the last check: twice the strain that guards allow
+BLOCK = 16  # segments that a CPU tests at once: one vector of float32
 
 
 @functools.cache
@@ -32,13 +34,13 @@ def struct(p: Precision) -> Any:
     class Neighbours:
         position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
         left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
-        # When that was last asked; [E + BLOCK] midpoints of segments and half their lengths, a tenth added.
+        # At the last such test, [E + BLOCK]: midpoints of segments, and 0.55 times their lengths.
         x: wp.array(dtype=wp.float32)  # [um]
         y: wp.array(dtype=wp.float32)
         z: wp.array(dtype=wp.float32)
         half: wp.array(dtype=wp.float32)
         extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
-        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
+        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists are no longer valid
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
         earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
         segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
@@ -47,7 +49,7 @@ def struct(p: Precision) -> Any:
 
 
 def allocate(model: DeviceModel) -> Any:
-    """Arrays of the struct `Neighbours`, with lists that do not hold yet; none without steric forces."""
+    """Arrays of the struct `Neighbours`, with lists that are not valid yet; none without steric forces."""
     p, near, device = model.precision, struct(model.precision)(), model.device
     if not model.switches.has("steric"):
         return near
@@ -75,7 +77,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def candidates(model: Model, near: Neighbours, e: wp.int32):
-        """How many segments are to be looked at for segment e."""
+        """Number of segments to be tested against segment e."""
         n = near.count[e]
         if n < 0:
             c = model.cell_of[e]
@@ -95,7 +97,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def first_later(model: Model, near: Neighbours, e: wp.int32):
-        """From which candidate on they are of later flagella."""
+        """Index of the first candidate of a later flagellum."""
         if near.count[e] >= 0:
             return near.earlier[e]
         return model.first_node[model.flagellum_of[e] + 1] - model.first_node[model.first_flagellum[model.cell_of[e]]]
@@ -106,7 +108,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def next_near(longest: real, j: wp.int32, distance: real, reach: real):
-        """The next segment of a flagellum that can be near: along it, midpoints move on by no more than the lengths.
+        """The next segment after j that can be near: neighbouring midpoints are at most a segment's length apart.
 
         Args:
             longest: length of its longest segment [um].
@@ -142,14 +144,13 @@ def functions(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def lists(p: Precision) -> SimpleNamespace:
-    """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
+    """Device functions: whether the lists of a flagellum are outdated, the list of one segment, all of a cell."""
     real = p.real
     Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     middle = functions(p).middle
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
-    # Lengths hardly change; what they do is in the skin, like what the nodes move. So is what float32 leaves of a
-    # place.
+    # Half a length with a tenth added, for the stretch while lists are valid and for positions rounded to float32.
     half_share = wp.constant(real(0.55))
     module = p.module("neighbours_functions")
 
@@ -168,7 +169,7 @@ def lists(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
-        """1: a node of flagellum k has moved by more than half the skin; else 0. Also notes where its segments are."""
+        """1: a node of flagellum k has moved by more than half the skin; else 0. Also stores midpoints of segments."""
         left = int(0)
         begin = model.first_node[k]
         end = model.first_node[k + 1]
@@ -219,7 +220,7 @@ def lists(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def refresh_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
-        """All lists of cell c, if one of them no longer holds."""
+        """Rebuilds all lists of cell c, if one of them is no longer valid."""
         stale = int(0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -298,7 +299,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def refresh(model: DeviceModel, state: DeviceState) -> None:
-    """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
+    """Makes the lists valid at the current positions: rebuilds those of cells in which a node has moved too far."""
     kernels, near, device = _kernels(model.precision), state.neighbours, model.device
     inputs = [model.data, state.data, near]
     if model.plan.by_cells:

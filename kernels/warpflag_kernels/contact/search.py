@@ -1,8 +1,8 @@
-"""The search for contacts: which pairs may touch in a step, where, and along which direction.
+"""The search for contacts: which pairs may touch in a step, their closest points and their normals.
 
 Pairs within the cutoff plus a margin, flagellum against flagellum and node against body, go into one list per cell:
-counted per segment, summed, filled, and chained for the segments of the other side; no atomics, the same order every
-time.
+counted per segment, summed up, filled in, and linked for the segments of the other side; no atomics, the same order
+every time.
 """
 
 import functools
@@ -16,8 +16,8 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, steric
 from warpflag_kernels.contact.constants import CUTOFF
 
-MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
-REACH = CUTOFF + MARGIN  # of what is listed [sigma]
+MARGIN = 0.3  # added to the cutoff for the error of the predicted pose [sigma]
+REACH = CUTOFF + MARGIN  # largest gap of a listed pair [sigma]
 
 
 @functools.cache
@@ -36,11 +36,11 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
-    def meets_at(
+    def set_pair(
         model: Model, pose: Pose, listed: Contacts, i: wp.int32, e: wp.int32, j: wp.int32,
         at: real, at_other: real, apart: vec3, r: real,
     ):  # fmt: skip
-        """Where and how segments e and j are in contact i, r apart."""
+        """Parameters, gap and normal of contact i, of segments e and j at the distance r."""
         listed.at[i] = at
         listed.at_other[i] = at_other
         listed.gap[i] = r
@@ -49,8 +49,8 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         listed.normal[i] = direction(apart, r, along, other, model.steric.diameter[model.cell_of[e]])
 
     @wp.func(module=module)
-    def stands_off(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
-        """How a node is in contact i with the body, so far away from its axis."""
+    def set_node(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
+        """Gap and normal of contact i, of a node with the body; away: from the body's axis to the node."""
         distance = wp.length(away)
         listed.gap[i] = distance - model.body.radius[c]
         listed.normal[i] = away / distance
@@ -66,9 +66,11 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         room: wp.int32,
         asked: wp.uint64,
     ):
-        """Contacts that belong to element e, with segments of later flagella and with the body, recorded from `start`
-        as far as there is room; how many there are, and a bit for each candidate that is one. Of a list's candidates
-        those `asked` are looked at, of a longer one's all."""
+        """Lists the contacts of element e with segments of later flagella and with the body, from `start` on.
+
+        Returns how many there are, listed only if there is room, and a bit for each candidate that is one. Of at most
+        64 candidates those whose bit is set in `asked` are tested, of more candidates all.
+        """
         k = model.flagellum_of[e]
         c = model.cell_of[e]
         reach = reach_factor * model.steric.diameter[c]
@@ -100,7 +102,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 i = start + found
                                 listed.segment[i] = e
                                 listed.other[i] = j
-                                meets_at(model, pose, listed, i, e, j, at, at_other, apart, r)
+                                set_pair(model, pose, listed, i, e, j, at, at_other, apart, r)
                                 anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
                                 first = model.first_node[model.flagellum_of[j]]
                                 listed.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
@@ -117,7 +119,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                     listed.other[i] = -1
                     listed.at[i] = real(1.0)
                     listed.at_other[i] = real(0.0)
-                    stands_off(model, listed, i, away, c)
+                    set_node(model, listed, i, away, c)
                 found += 1
         return found, seen
 
@@ -233,7 +235,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         # Out:
         listed: Contacts,
     ):
-        """All of that for a cell at once, for a CPU: every pair is looked at once."""
+        """The list of a whole cell by one thread, for a CPU: every pair is tested once."""
         c = wp.tid()
         if state.active[c] == 0:
             return
@@ -289,11 +291,11 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         while i < listed.stop[e]:
             j = listed.other[i]
             if j < 0:
-                stands_off(model, listed, i, off_axis(model, pose, e, c), c)
+                set_node(model, listed, i, off_axis(model, pose, e, c), c)
             else:
                 p1, p2 = pose.position[e - 1], pose.position[j - 1]
                 at, at_other, apart = nearest(p1, pose.position[e], p2, pose.position[j])
-                meets_at(model, pose, listed, i, e, j, at, at_other, apart, wp.length(apart))
+                set_pair(model, pose, listed, i, e, j, at, at_other, apart, wp.length(apart))
             i += 1
 
     return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, list_cells=list_cells, renew=renew)
@@ -303,7 +305,9 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
     """Lists every pair of a pose that is in contact or may come into contact within a step.
 
     Args:
-        pose: the one that `state` holds.
+        model, state: of the batch.
+        pose: the pose of `state`.
+        contacts_out: struct `Contacts`.
     """
     if model.switches.has("steric"):
         neighbours.refresh(model, state)
@@ -319,7 +323,7 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
 
 
 def renew(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
-    """Gaps, directions and levers of the listed contacts in a pose."""
+    """Closest points, gaps and normals of the listed contacts in another pose; arguments as in `find`."""
     kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs = [model.data, state.data, pose, contacts_out]
     wp.launch(kernels.renew, model.element_count, inputs=inputs, device=model.device)

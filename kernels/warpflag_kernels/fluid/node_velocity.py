@@ -104,9 +104,10 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
     def velocities(
         # Model:
         model: Model,
+        # State:
+        s: PairSum,
         # Out:
         state: State,
-        s: PairSum,
     ):
         e, thread = wp.tid()
         c = model.cell_of[e]
@@ -148,4 +149,5 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     threads = plan.gathering_threads
     block = WARP if threads > 1 and device.is_cpu else 256  # on a CPU the threads of a block are fibers that meet
+    inputs = [model.data, state.pairs, state.data]
     wp.launch(kernels.velocities, (model.element_count, threads), inputs=inputs, device=device, block_dim=block)

@@ -1,4 +1,4 @@
-// The wanted change of the gaps: -residual and the known loads' shares of their answers.
+// The wanted change of the gaps: -residual plus the answers, each times its coefficient from the linear system.
 REAL* __restrict__ C = law.wanted.data + begin; const REAL* __restrict__ R = law.residual.data + begin;
 for (int i = thread; i < count; i += THREADS) C[i] = -R[i];
 for (int m = 0; m < n; ++m) {

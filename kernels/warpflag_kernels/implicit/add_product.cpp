@@ -1,4 +1,4 @@
-// What a product has found, added to what was found before.
+// Adds a product to the sums of all products: over contacts [begin, stop) and over elements [first, end).
 REAL* __restrict__ A = law_in.applied.data; const REAL* __restrict__ L = law_in.load.data;
 REAL* __restrict__ N = law_in.answered.data; const REAL* __restrict__ C = law_in.change.data;
 #ifndef __CUDACC__

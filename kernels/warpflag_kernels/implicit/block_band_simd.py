@@ -1,6 +1,6 @@
-"""The block band on a CPU: factors and solutions of flagella side by side. The mathematics is that of `cholesky`.
+"""The block band on a CPU: factors and solutions of several flagella in vector lanes, by the method of `cholesky`.
 
-A flagellum shorter than its group goes on with unit rows, which are coupled to nothing.
+A flagellum shorter than the longest of its group is continued by unit rows without coupling.
 """
 
 import functools

@@ -1,21 +1,24 @@
 """Linearly implicit stepping of second order: collocation of a quadratic path, solved in two iterations.
 
-The path leads through the last two states and the next one, and obeys the equations of motion at the time theta dt of
-the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it passes there at theta w delta + e, so
+The path leads through the last two states and the next one, and obeys the equations of motion at the collocation point,
+the time theta dt of the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it passes there at
+theta w delta + e, so
 
     e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
 
-and the whole step is w delta + e/rho. The error goes as 3 theta^2 - 1, and stiff modes are damped for any theta above
-2^-1/2, but ring for a while below 1. So a step whose end is looked at from outside takes theta = 1, which is BDF2 and
-leaves them where they belong. Both iterations evaluate V once, at the pose known so far, and solve for what is missing:
+and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
+theta above 2^-1/2, but alternate in sign for some steps below 1. So a step that ends at an output time takes theta = 1,
+which is BDF2: recorded forces and energies are then those of an equilibrated state. Both iterations evaluate V once, at
+the pose known so far, and solve for what is missing:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
-in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
-the explicit flows of the pair sum stable; the second iteration squares what that leaves, and finds V, contacts and
-levers where the first one led. V holds the forces F_x that the contacts are thought to have, and those that count, F,
-obey the exact law. Every step is checked before it is taken: solves, guards and the error estimate. A step that fails
-is taken again, shorter.
+in the chain chart, F the contact forces, B the contact Jacobian, F_x the contact forces that V was evaluated with. The
+matrix holds the local mobility D in place of M, and s = g times the over-implicitness in place of g, which keeps the
+explicit flows of the pair sum stable. The second iteration squares the relative error that this leaves, and evaluates
+V, contacts and Jacobian anew where the first one led. F obeys the exact steric law at the gaps that the step leads to.
+Every step is checked before it is taken: solves, guards and the error estimate. A step that fails is taken again,
+shorter.
 """
 
 import functools
@@ -37,17 +40,21 @@ from warpflag_kernels.stepping import step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
-THETA = 0.8  # where in a step the equations hold, unless its end is looked at from outside
-# Error that counts over the mean of what the predictions of a cell's nodes miss, for theta = 1. The mean is what is
-# followed: contacts that open, close or pass a vertex make single nodes jump, which does not add up.
-PEAK = 7.0
-GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
-GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
+# Collocation point of a step that does not end at an output time, as a fraction of the step. The truncation error
+# falls with it as 3 theta^2 - 1, but stiff modes are damped less: by 0.67 a step at 0.8, by 0.84 at 0.75
+# (docs/numerics.md).
+THETA = 0.8
+# Error estimate over the mean predictor error of a cell's nodes, for theta = 1; measured. The mean is controlled,
+# since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
+ERROR_PER_PREDICTOR = 7.0
+GAP_SHARE = 0.35  # residual of the gaps that the contact solve may leave, over the error that a step may make
+# A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
+GAP_GROWTH = 4.0e9
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Implicit`: the clockwork of every cell, per cell [C] unless said otherwise."""
+    """The struct `Implicit`: step history and coefficients of the current step, per cell [C] unless said otherwise."""
     real = p.real
 
     @wp.struct
@@ -55,21 +62,17 @@ def struct(p: Precision) -> Any:
         over_implicit: wp.array(dtype=wp.float64)
         last_step: wp.array(dtype=wp.float64)  # [s]
         step_before: wp.array(dtype=wp.float64)  # [s]
-        history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
+        history: wp.array(dtype=wp.int32)  # how many earlier increments there are: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
-        theta: wp.array(dtype=wp.float64)  # where in the step the equations hold
-        ahead: wp.array(dtype=wp.float64)  # theta w
+        theta: wp.array(dtype=wp.float64)  # collocation point as a fraction of the step
+        ahead: wp.array(dtype=wp.float64)  # theta w, scale of the extrapolation by the last increment
         reach: wp.array(dtype=wp.float64)  # rho
-        curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
+        curvature: wp.array(dtype=wp.float64)  # factor of the second difference of earlier increments in predicted e
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
-        one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
-        predictor_error: wp.array(
-            dtype=real
-        )  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
-        predicted_displacement: wp.array(
-            dtype=real
-        )  # [K], lengths of what was predicted for them, summed up [um]
-        trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
+        one: wp.array(dtype=wp.float64)  # 1, the scale of a retraction by a whole increment
+        predictor_error: wp.array(dtype=real)  # [K], predictor error: sum over the nodes of |e - predicted e| [um]
+        predicted_displacement: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e| [um]
+        trust: wp.array(dtype=wp.float64)  # 1 less the predictor error of the last step over its prediction, at least 0
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
@@ -80,8 +83,8 @@ def allocate(model: DeviceModel) -> Any:
     """Arrays of the struct `Implicit`, zero but for `one`."""
     p, device = model.precision, model.device
     i = struct(p)()
-    floats = ("over_implicit", "last_step", "step_before", "ratio", "theta", "ahead", "reach", "curved", "ratio_before")
-    for name in (*floats, "trust"):
+    floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "reach")
+    for name in (*floats, "curvature", "trust"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
     for name in ("history", "accepted", "evaluations"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
@@ -104,7 +107,7 @@ def kernels(p: Precision) -> SimpleNamespace:
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     advanced = clock.functions().advanced
     module = p.module("collocation")
-    inside, peak = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(PEAK))
+    theta_inside, per_predictor = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(ERROR_PER_PREDICTOR))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
@@ -115,9 +118,9 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
         # Out:
+        control: Control,
         imp: Implicit,
         band: Band,
         contacts_out: Contacts,
@@ -132,7 +135,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = wp.float64(0.0)
         if imp.history[c] > 0:
             w = dt / imp.last_step[c]
-        theta = inside
+        theta = theta_inside
         if dt >= left:
             theta = one
         mu = w / (one + w)
@@ -143,11 +146,11 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.theta[c] = theta
         imp.ahead[c] = theta * w
         imp.reach[c] = rho
-        imp.curved[c] = wp.float64(0.0)
+        imp.curvature[c] = wp.float64(0.0)
         imp.ratio_before[c] = wp.float64(0.0)
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
-            imp.curved[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
+            imp.curvature[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
@@ -171,12 +174,12 @@ def kernels(p: Precision) -> SimpleNamespace:
         # Out:
         predicted: Increment,
     ):
-        """What e is on a path that is quadratic in time, as the last two increments say."""
+        """The predictor: e of the quadratic path through the last three states."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
-        scale = real(imp.curved[c])
+        scale = real(imp.curvature[c])
         ratio = real(imp.ratio_before[c])
         predicted.node[e] = scale * (last.node[e] - ratio * before.node[e])
         if e == model.first_node[model.first_flagellum[c]]:
@@ -204,11 +207,11 @@ def kernels(p: Precision) -> SimpleNamespace:
         gain = real(law.gain[c])
         inv_dt = real(wp.float64(1.0) / band.step[c])
         slope = gain * real(imp.ratio[c] / band.step[c])
-        gone = slope * last.node[e] + inv_dt * found.node[e]
-        spin = gain * model.drag.spin_mobility[k] * state.spin_torque[e] - gone[3]
+        known = slope * last.node[e] + inv_dt * found.node[e]
+        spin = gain * model.drag.spin_mobility[k] * state.spin_torque[e] - known[3]
         v = vec3(real(0.0))
         if e > model.first_node[k]:
-            v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
+            v = gain * state.velocity[e] - vec3(known[0], known[1], known[2])
             v = drag(band, e, v)
         elif k == model.first_flagellum[c]:
             u = state.body_velocity[c]
@@ -223,17 +226,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        imp: Implicit,
         last: Increment,
         found: Increment,
         predicted: Increment,
         x: Increment,
         # Out:
+        imp: Implicit,
         total: Increment,
-        rest: Increment,
+        remaining: Increment,
         chart: Chart,
     ):
-        """The whole step, what of it is left to go, and the error estimates of a flagellum."""
+        """The whole step, what remains of it from the present pose, and the predictor error of a flagellum."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
@@ -251,7 +254,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             d = f - p  # third divided difference of the path
             t = w * last.node[e] + whole * f
             total.node[e] = t
-            rest.node[e] = t - ahead * last.node[e] - found.node[e]
+            remaining.node[e] = t - ahead * last.node[e] - found.node[e]
             if e > first:
                 predictor_error += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
                 predicted_displacement += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
@@ -264,8 +267,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         if k == model.first_flagellum[c]:
             b = w * last.body[c] + whole * (found.body[c] + x.body[c])
             total.body[c] = b
-            rest.body[c] = b - ahead * last.body[c] - found.body[c]
-            chart.commit[c] = 1  # the guards look at this pose
+            remaining.body[c] = b - ahead * last.body[c] - found.body[c]
+            chart.commit[c] = 1  # the guards check this pose
             chart.body_increment[c] = vec6d(
                 wp.float64(b[0]),
                 wp.float64(b[1]),
@@ -305,7 +308,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             k += 1
         theta = imp.theta[c]
         truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
-        error = peak * truncated * predictor_error / wp.float64(nodes)
+        error = per_predictor * truncated * predictor_error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
@@ -349,11 +352,11 @@ def kernels(p: Precision) -> SimpleNamespace:
     @wp.kernel(module=module)
     def keep_bodies(
         # State:
-        state: State,
         next_last: Increment,
         next_before: Increment,
         imp: Implicit,
         # Out:
+        state: State,
         last: Increment,
         before: Increment,
         control: Control,

@@ -1,7 +1,6 @@
-"""Loops over the contacts of a cell that its law takes many times: what they need of the law is C++, as vector code.
+"""Loops over the contacts of a cell in its contact solve, in C++ so that a CPU's compiler makes vector code of them.
 
-A compiler makes them vector loops only where it is told that arrays do not overlap, and where nothing branches. On a
-GPU the threads of a block share each loop.
+On a GPU the threads of a block share each loop.
 """
 
 import functools
@@ -16,7 +15,7 @@ from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.rod import chain_chart
 
-SETTLING = 4  # iterations of a contact's own equation
+SETTLING = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
 
 
 @functools.cache

@@ -1,10 +1,14 @@
-"""How the contacts of a step answer to forces: products with the compliance W, without the matrix.
+"""The Delassus operator of a step's contacts: changes of the gaps per contact force, as products without the matrix.
 
-A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda. B puts it on
-the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off.
+Contact forces lambda change the increment by Y lambda and the gaps by W lambda. With the contact Jacobian B
 
-One block of threads takes one cell: on CUDA its threads share every loop and wait for each other between them, on a CPU
-a single thread does it all.
+    Y = P g M B,      W = B^T Y :
+
+B distributes contact forces to nodes and bodies, M is the mobility with the Rotne-Prager sum, P the inverse of the
+step's matrix.
+
+One block of threads takes one cell: on CUDA its threads share every loop and synchronise between them, on a CPU a
+single thread does it all.
 """
 
 import functools
@@ -23,7 +27,7 @@ from warpflag_kernels.rod import chain_chart
 
 @wp.func_native("WP_TILE_SYNC();")
 def meet():
-    """Lanes of a block wait for each other; what one has written the others read."""
+    """Threads of a block wait for each other; what one has written the others read."""
     ...
 
 
@@ -36,20 +40,18 @@ def struct(p: Precision) -> Any:
     @wp.struct
     class ContactLaw:
         # Per contact [capacity].
-        free_gap: wp.array(dtype=real)
-        solved_gap: wp.array(dtype=real)
-        residual: wp.array(dtype=real)
-        force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to [pN]
-        applied: wp.array(dtype=real)  # all that it has been applied to in a solution [pN]
-        answered: wp.array(dtype=real)  # and what that has changed [um]
+        free_gap: wp.array(dtype=real)  # at the end of the step, if contact forces do not change [um]
+        solved_gap: wp.array(dtype=real)  # the unknown [um]
+        residual: wp.array(dtype=real)  # solved_gap - free_gap - W applied [um]
+        force: wp.array(dtype=real)  # contact force that velocities are evaluated with [pN]
+        load: wp.array(dtype=real)  # vector that the next product applies W to [pN]
+        applied: wp.array(dtype=real)  # sum of all vectors that W has been applied to in this solution [pN]
+        answered: wp.array(dtype=real)  # W applied [um]
         change: wp.array(dtype=real)  # W load [um]
-        diagonal: wp.array(
-            dtype=real
-        )  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
-        share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `diagonal` alone
-        wanted: wp.array(dtype=real)  # change of the gap, less what it yields to its own force [um]
-        # What is known of W, see `quasi_newton`: loads of unit length, and their answers beyond `diagonal`.
+        diagonal: wp.array(dtype=real)  # diagonal compliance, an estimate of W's diagonal [um/pN]
+        share: wp.array(dtype=real)  # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact
+        wanted: wp.array(dtype=real)  # change of gap - d F(gap) that the linear model asks for [um]
+        # Secant pairs, see `quasi_newton`: orthonormal vectors, and W less the diagonal applied to them.
         loads: wp.array(dtype=real)  # [KEPT * capacity]
         answers: wp.array(dtype=real)  # [KEPT * capacity]
         # Per element [E], flagellum [K], thread [C * threads of a block].
@@ -58,14 +60,14 @@ def struct(p: Precision) -> Any:
         on_node: wp.array(dtype=vec3)
         on_body: wp.array(dtype=vec6)  # [K]
         answer: Increment  # Y load
-        partial: wp.array(dtype=real)  # of sums and maxima
+        partial: wp.array(dtype=real)  # every thread's part of a sum or maximum
         # Per cell [C].
         gain: wp.array(dtype=wp.float64)  # g
         tolerance: wp.array(dtype=real)  # of a gap [um]
-        small: wp.array(dtype=real)  # [C * SMALL], the system of the shares of known loads
-        known: wp.array(dtype=wp.int32)  # how many of these there have been
+        small: wp.array(dtype=real)  # [C * SMALL], the linear system in the span of the secant pairs
+        known: wp.array(dtype=wp.int32)  # secant pairs found so far
         products: wp.array(dtype=wp.int32)  # with W, so far
-        failed: wp.array(dtype=wp.int32)  # 1: not solved
+        failed: wp.array(dtype=wp.int32)  # 1: the gaps were not found
 
     return ContactLaw
 
@@ -187,8 +189,8 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
         if wp.static(pairs != "none"):
             e = begin + thread
             while e < end:
-                if flow.place[e] >= 0:
-                    load(flow, flow.place[e], law.on_node[e])
+                if flow.slot[e] >= 0:
+                    load(flow, flow.slot[e], law.on_node[e])
                 e += threads
         meet()
         if wp.static(form != "gathered"):

@@ -1,5 +1,5 @@
-// Row by row: 1 + loads . share answers, and loads . share residual. A thread of a GPU does single entries, a CPU four columns
-// at once.
+// The linear system, row by row: 1 + loads . share answers, and loads . share residual. A thread of a GPU does single
+// entries, a CPU four columns at once.
 const REAL* L = law.loads.data + own; const REAL* A = law.answers.data + own;
 const REAL* __restrict__ W = law.share.data + begin; const REAL* R = law.residual.data + begin;
 #ifdef __CUDACC__

@@ -26,7 +26,7 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
     Increment, Band, vec6 = chain_chart.types(p).Increment, block_band.types(p).Band, block_band.types(p).vec6
     drag = block_band.functions(p).drag
     Flow, flows = flow_stage.struct(p), flow_stage.functions(p, pairs, form, threads)
-    load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
+    load, spread, flow_at, slots_end = flows.load, flows.spread, flows.flow_at, flows.slots_end
     module = p.module("linearised", f"{pairs}_{form}_{threads}")
 
     @wp.kernel(module=module)
@@ -39,8 +39,8 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
         flow: Flow,
     ):
         e = wp.tid()
-        if flow.place[e] >= 0 and state.active[model.cell_of[e]] != 0:
-            load(flow, flow.place[e], state.force[e])
+        if flow.slot[e] >= 0 and state.active[model.cell_of[e]] != 0:
+            load(flow, flow.slot[e], state.force[e])
 
     @wp.kernel(module=module)
     def add_flows(
@@ -53,7 +53,7 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
     ):
         c = wp.tid()
         if state.active[c] != 0:
-            spread(model, flow, c, places_end(model, c))
+            spread(model, flow, c, slots_end(model, c))
 
     @wp.kernel(module=module)
     def complete(
@@ -80,7 +80,7 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
         if e > model.first_node[k]:
             v = vec3(y[0], y[1], y[2])
             if wp.static(pairs != "none"):
-                v -= g * flow_at(model, flow, e, k, c, places_end(model, c), thread)
+                v -= g * flow_at(model, flow, e, k, c, slots_end(model, c), thread)
             v = drag(band, e, v) - g * state.force[e]
         elif thread == 0 and k == model.first_flagellum[c]:
             u = state.body_velocity[c]
@@ -90,6 +90,11 @@ def _kernels(p: Precision, pairs: str, form: str, threads: int) -> SimpleNamespa
             out.node[e] = vec4(v[0], v[1], v[2], y[3] / model.drag.spin_mobility[k] - g * state.spin_torque[e])
 
     return SimpleNamespace(load_nodes=load_nodes, add_flows=add_flows, complete=complete)
+
+
+def allocate(model: DeviceModel, state: DeviceState) -> None:
+    """What the state needs for the first variation of forces beside what forces themselves need."""
+    state.data.stretch_change = wp.zeros(model.element_count, dtype=model.precision.vec3, device=model.device)
 
 
 def linearised_terms(model: DeviceModel) -> tuple[Term, ...]:

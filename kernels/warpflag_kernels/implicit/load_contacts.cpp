@@ -1,5 +1,5 @@
-// What forces at the solved gaps differ by from those that W has been applied to, and how stiff they are; returns a
-// thread's share of the sum of its squares.
+// Forces at the solved gaps less those that W has been applied to, into `load`, and `share`; returns this thread's part
+// of the sum of the squares of `load`.
 LAW
 const REAL* __restrict__ G = law_in.solved_gap.data; const REAL* __restrict__ F = law_in.force.data;
 const REAL* __restrict__ Y = law_in.diagonal.data; const REAL* __restrict__ A = law_in.applied.data;

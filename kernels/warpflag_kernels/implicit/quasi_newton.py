@@ -1,12 +1,12 @@
-"""What the products with the compliance W have told of it: loads, and how they are answered.
+"""A multisecant quasi-Newton model of the Delassus operator W, from the products made with it.
 
-Of a load that has been applied once the answer is known, and of whatever loads combine those applied. `learn` keeps
-what is new of a load beside the earlier ones, orthogonal to them, and what W makes of it beyond `diagonal`, the
-estimate that stands in for W where nothing is known. `combine` solves the linear contact law
+`learn` stores a secant pair: a vector that W has been applied to, made orthonormal to the earlier ones in the metric of
+the diagonal compliance d, and W - d applied to it. `combine` solves the contact law linearised at the present gaps,
 
-    wanted = -residual - (W - diagonal) (share/diagonal) wanted,    W - diagonal = sum of answers x diagonal loads
+    wanted = -residual - (W - d) (share/d) wanted,      W - d = sum of (answer)(d load)^T over the pairs,
 
-for the shares of the known loads: a system of as many unknowns as there are loads, which costs no product.
+in the span of the pairs: a system of as many unknowns as there are pairs, which costs no product. There
+share = d k/(1 + d k), k the stiffness of a contact.
 """
 
 import functools
@@ -21,9 +21,11 @@ from warpflag_kernels.base.types import DeviceModel
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.implicit.delassus import meet
 
-KEPT = 16  # loads at most; then each new one takes the place of the oldest
-SMALL = KEPT * (KEPT + 1)  # entries of the system of their shares
-SAME = 0.1  # share of a load that must be new for it to be kept: what round-off makes of less misleads
+KEPT = 16  # secant pairs at most; then each new one replaces the oldest. A step makes five to ten products
+SMALL = KEPT * (KEPT + 1)  # entries of the linear system in their span
+# A pair is kept if at least this fraction of its vector is orthogonal to the earlier ones: the round-off of float32
+# flows is 1e-6 of a product, so the part of W that is learnt from a smaller fraction has few digits.
+INDEPENDENT = 0.1
 
 
 @functools.cache
@@ -32,7 +34,7 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
     real, Law = p.real, delassus.struct(p)
     block_sum = delassus.reductions(p, threads).block_sum
     Reals = wp.array(dtype=real)
-    kept, small_size, same = wp.constant(KEPT), wp.constant(SMALL), wp.constant(real(SAME))
+    kept, small_size, independent = wp.constant(KEPT), wp.constant(SMALL), wp.constant(real(INDEPENDENT))
     module = p.module("quasi_newton", str(threads))
 
     @wp.func_native(native(__file__, "weighted_dot", p, THREADS=threads))
@@ -60,7 +62,7 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
 
     @wp.func(module=module)
     def learn(law: Law, c: wp.int32, begin: wp.int32, count: wp.int32, capacity: wp.int32, thread: wp.int32):
-        """Keeps what is new of `load`, and what `change`, its answer, says of it.
+        """Stores the secant pair of `load` and `change` = W load.
 
         Args:
             begin, count: where the cell's contacts lie; capacity: how many it has room for.
@@ -75,9 +77,7 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
             law.loads[at + i] = load
             law.answers[at + i] = law.change[begin + i] - law.diagonal[begin + i] * load
             i += threads
-        size = block_sum(
-            law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread
-        )
+        size = block_sum(law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread)
         m = int(0)
         while m < wp.min(known, kept):
             if m != slot:
@@ -85,26 +85,23 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
                 share = dot(law.loads, at, law.loads, other, law.diagonal, begin, count, thread)
                 remove(law, at, other, block_sum(law, share, c, thread), count, thread)
             m += 1
-        left = block_sum(
-            law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread
-        )
+        left = block_sum(law, dot(law.loads, at, law.loads, at, law.diagonal, begin, count, thread), c, thread)
         scale = real(0.0)
-        if left > same * same * size:
+        if left > independent * independent * size:
             scale = real(1.0) / wp.sqrt(left)
         i = int(thread)
         while i < count:
             law.loads[at + i] = scale * law.loads[at + i]
             law.answers[at + i] = scale * law.answers[at + i]
             i += threads
-        # A load without anything new stands as zero in its place, until the next one takes it.
+        # A dependent vector is stored as zero; the next pair overwrites it.
         if thread == 0 and scale > real(0.0):
             law.known[c] = known + 1
         meet()
 
     @wp.func(module=module)
     def combine(law: Law, c: wp.int32, begin: wp.int32, count: wp.int32, capacity: wp.int32, thread: wp.int32):
-        """What is to be added to a gap less what it yields to its own force, into `wanted`: from `residual` and
-        `share`, of a change of a gap the part that its force takes back."""
+        """The change of gap - d F(gap) that the linearised law asks for, into `wanted`; from `residual` and `share`."""
         n = wp.min(law.known[c], kept)
         own = kept * begin
         first = c * small_size

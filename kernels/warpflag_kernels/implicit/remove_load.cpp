@@ -1,4 +1,4 @@
-// Load and answer at j, times share, taken from those at i.
+// Secant pair i less share times secant pair j.
 REAL* __restrict__ A = law.loads.data + i; const REAL* __restrict__ B = law.loads.data + j;
 REAL* __restrict__ C = law.answers.data + i; const REAL* __restrict__ D = law.answers.data + j;
 #ifndef __CUDACC__

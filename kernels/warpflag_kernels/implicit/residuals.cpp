@@ -1,4 +1,4 @@
-// Residuals, and the largest. Compared as integers, what is not a number is larger than all others.
+// Residuals, and the largest of this thread. Compared as integers, NaN is larger than all numbers.
 const REAL* __restrict__ G = law_in.solved_gap.data; const REAL* __restrict__ F = law_in.free_gap.data;
 const REAL* __restrict__ N = law_in.answered.data; REAL* __restrict__ R = law_in.residual.data;
 BITS worst = 0;

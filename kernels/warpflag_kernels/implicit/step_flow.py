@@ -1,13 +1,13 @@
-"""Flows that changes of forces cause within an implicit step: the pair sum, many times over at the same positions.
+"""The Rotne-Prager sum at positions that stand still during an implicit step, for many different forces.
 
-Contact forces need it, since two filaments that push each other apart drag the fluid between them along, which makes
-the gap several times harder to open than local drag alone would. So does the first iteration of a step for all forces,
-and the measurement of the step's stability. All are about what changes within a step, so single precision is enough in
-either build.
+The contact solve needs it: two filaments that push each other apart drag the fluid between them along, which makes the
+gap several times harder to open than with local drag alone. So do the velocities of a step's first iteration, and the
+measurement of its stability. Single precision is enough for all three: they enter through changes within a step, or are
+corrected by the second iteration.
 
-The places of a cell hold its moving nodes, those that contacts can load first, both flagellum after flagellum. A CPU
-keeps the coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading
-them would take as long as finding them again.
+Nodes are reordered: the slots of a cell hold its moving nodes, first those that contacts can load, then the others,
+both flagellum after flagellum. A CPU stores the coefficients of every pair (i, j < i) of a cell, row after row, unless
+the cell is so large that reading them takes as long as finding them again (`Plan.step_pairs`).
 """
 
 import functools
@@ -26,18 +26,18 @@ from warpflag_kernels.fluid import rotne_prager
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `StepFlow`: which node is where in the sum, and the coefficients of its pairs."""
+    """The struct `StepFlow`: the order of nodes in the sum, and the coefficients of their pairs."""
     PairSum, single = rotne_prager.struct(p.single), p.single.real
 
     @wp.struct
     class StepFlow:
-        loaded: wp.array(dtype=wp.int32)  # [K], nodes that may be loaded by a contact
-        start: wp.array(dtype=wp.int32)  # [K], places of these nodes lie in [start, start + loaded)
-        rest: wp.array(dtype=wp.int32)  # [K], where those of the flagellum's other nodes begin
-        node: wp.array(dtype=wp.int32)  # [E], of a place; a cell's places begin where its elements do
-        place: wp.array(dtype=wp.int32)  # [E], of a node; -1: of r_0, which is not in the sum
-        sum: PairSum  # by place
-        # Coefficients c, q of the pairs, only where they are kept.
+        loaded: wp.array(dtype=wp.int32)  # [K], number of nodes that a contact may load
+        start: wp.array(dtype=wp.int32)  # [K], slots of these nodes lie in [start, start + loaded)
+        rest: wp.array(dtype=wp.int32)  # [K], first slot of the flagellum's other nodes
+        node: wp.array(dtype=wp.int32)  # [E], node of a slot; a cell's slots begin where its elements do
+        slot: wp.array(dtype=wp.int32)  # [E], slot of a node; -1: of r_0, which is not in the sum
+        sum: PairSum  # by slot
+        # Coefficients c, q of the pairs, flow = c f + q (q . f); only where they are stored.
         first_pair: wp.array(dtype=wp.int32)  # [C], of a cell's pairs
         c: wp.array(dtype=single)  # [pairs], of the force [1/um]
         qx: wp.array(dtype=single)  # [pairs], along the nodes' distance [um^-1/2]
@@ -63,7 +63,7 @@ def rows(p: Precision) -> Any:
 @functools.cache
 def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNamespace:
     """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
-    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`. Lanes: threads
+    `spread` where pairs are taken once, then `flow_at` any node; for one `Plan.step_pairs`. Threads: those
     that share what is gathered at a node, one or those of a warp."""
     real, vec3, single = p.real, p.vec3, p.single
     Model, Flow = structs(p).Model, struct(p)
@@ -76,24 +76,24 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
     module = p.module("flow_functions", f"{pairs}_{form}_{threads}")
 
     @wp.func(module=module)
-    def load(flow: Flow, place: wp.int32, f: vec3):
-        """Puts a force on the node of a place [pN]."""
-        flow.sum.fx[place] = single.real(f[0])
-        flow.sum.fy[place] = single.real(f[1])
-        flow.sum.fz[place] = single.real(f[2])
+    def load(flow: Flow, slot: wp.int32, f: vec3):
+        """Puts a force on the node of a slot [pN]."""
+        flow.sum.fx[slot] = single.real(f[0])
+        flow.sum.fy[slot] = single.real(f[1])
+        flow.sum.fz[slot] = single.real(f[2])
         if wp.static(symmetric):
-            flow.sum.ux[place] = zero
-            flow.sum.uy[place] = zero
-            flow.sum.uz[place] = zero
+            flow.sum.ux[slot] = zero
+            flow.sum.uy[slot] = zero
+            flow.sum.uz[slot] = zero
 
     @wp.func(module=module)
-    def places_end(model: Model, c: wp.int32):
-        """Where the places of a cell end."""
+    def slots_end(model: Model, c: wp.int32):
+        """Where the slots of a cell end."""
         return model.first_node[model.first_flagellum[c + 1]] - model.first_flagellum[c + 1] + model.first_flagellum[c]
 
     @wp.func(module=module)
     def loaded_end(model: Model, flow: Flow, c: wp.int32):
-        """Where the places of a cell's nodes end that contacts can load."""
+        """Where the slots of a cell's nodes end that contacts can load."""
         last = model.first_flagellum[c + 1] - 1
         return flow.start[last] + flow.loaded[last]
 
@@ -111,9 +111,9 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
 
     @wp.func(module=module)
     def spread(model: Model, flow: Flow, c: wp.int32, sources: wp.int32):
-        """The sum by halves, where one thread does a whole cell; beyond the places `sources` nothing is loaded."""
+        """The symmetric sum of a whole cell by one thread; slots from `sources` on carry no force."""
         begin = model.first_node[model.first_flagellum[c]]
-        end = places_end(model, c)
+        end = slots_end(model, c)
         i = begin
         while i < end:
             stop = wp.min(i, sources)
@@ -135,7 +135,7 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
     @wp.func(module=module)
     def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32, thread: wp.int32):
         """Velocity of node e of flagellum k that the forces cause through the pair sum [um/s]."""
-        i = flow.place[e]
+        i = flow.slot[e]
         ux = zero
         uy = zero
         uz = zero
@@ -168,7 +168,7 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
             uz = u[2]
         return model.pairs.mobility[c] * vec3(real(ux), real(uy), real(uz))
 
-    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, places_end=places_end)
+    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, slots_end=slots_end)
 
 
 @functools.cache
@@ -237,18 +237,18 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
         flow.start[own] = loaded
         flow.rest[own] = unloaded
         while e < end:
-            place = loaded
+            slot = loaded
             if may_be_loaded(contacts_in, e, end):
                 loaded += 1
             else:
-                place = unloaded
+                slot = unloaded
                 unloaded += 1
-            flow.node[place] = e
-            flow.place[e] = place
+            flow.node[slot] = e
+            flow.slot[e] = slot
             x = state.pose.position[e]
-            flow.sum.x[place] = real(x[0])
-            flow.sum.y[place] = real(x[1])
-            flow.sum.z[place] = real(x[2])
+            flow.sum.x[slot] = real(x[0])
+            flow.sum.y[slot] = real(x[1])
+            flow.sum.z[slot] = real(x[2])
             e += 1
 
     @wp.func_native(native(__file__, "store_row", p.single, TENSOR=rotne_prager.tensor_code(p.single)))
@@ -286,7 +286,7 @@ def allocate(model: DeviceModel) -> Any:
 
     flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
     flow.node = zeros(model.element_count, wp.int32)
-    flow.place = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
+    flow.slot = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
     form = model.plan.step_pairs
     results = () if form == "gathered" else ("ux", "uy", "uz")
     for name in ("x", "y", "z", "fx", "fy", "fz", *results):
@@ -302,7 +302,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
-    """Places, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
+    """Slots, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
     kernels, device = _kernels(model.precision, contacts_in is not None), model.device
     listed = contact_list.struct(model.precision)() if contacts_in is None else contacts_in
     inputs = [model.data, state.data, listed, flow]

@@ -1,4 +1,4 @@
-// A thread's share of the sum over contacts of a b weight.
+// This thread's part of the sum over contacts of a b weight.
 const REAL* __restrict__ A = a.data + i; const REAL* __restrict__ B = b.data + j;
 const REAL* __restrict__ W = weight.data + k;
 REAL total = 0;

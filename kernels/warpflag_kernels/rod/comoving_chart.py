@@ -3,8 +3,8 @@
 A node moves as r = r_0 + Q (d + x): d is its offset from the anchor at the start of the step, x its increment and
 Q = exp(t W) the rotation of its flagellum at the angular velocity W fitted to the velocities at the start. Directors
 follow the tangent by the minimal rotation inside that rotating frame and then turn by the spin increment. The
-rotation of a helix about its axis, most of its motion, is thus carried exactly and the increments stay small and
-smooth; with W = 0 this is the plain chart. The rates are exact in either: no order is lost to the chart.
+rotation of a helix about its axis, most of its motion, is thus represented exactly, and the increments stay small and
+smooth; with W = 0 they are plain displacements. The rates are exact for any W: the chart costs no order of accuracy.
 """
 
 import functools
@@ -22,7 +22,7 @@ vec6d = wp.types.vector(6, wp.float64)
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Chart`: the state at the start of the step and the increments and rates since."""
+    """The struct `Chart`: the pose at the start of the step, and the increments and rates since."""
     vec3, vec4, mat33, Pose = p.vec3, p.vec4, p.mat33, structs(p).Pose
 
     @wp.struct
@@ -31,8 +31,8 @@ def struct(p: Precision) -> Any:
         flagellum_spin: wp.array(dtype=vec3)  # [K], W [rad/s]
         # Now.
         elapsed: wp.array(dtype=wp.float64)  # [C], time since the start of the step [s]
-        commit: wp.array(dtype=wp.int32)  # [C], 1: the placed state becomes the start of the next step
-        rest: wp.array(dtype=wp.int32)  # [C], 1: the placed state is a start of a step (its increments vanish)
+        commit: wp.array(dtype=wp.int32)  # [C], 1: the present pose becomes the start of the next step
+        rest: wp.array(dtype=wp.int32)  # [C], 1: the present pose is the start of a step (its increments vanish)
         flagellum_turn: wp.array(dtype=mat33)  # [K], Q
         increment: wp.array(dtype=vec4)  # [E], node x [um] and spin [rad]
         rate: wp.array(dtype=vec4)  # [E] [um/s, rad/s]
@@ -176,8 +176,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[first]
         if state.active[c] == 0 or chart.rest[c] == 0:
             return
-        # Least squares over node velocities relative to the anchor. Spins count little: a straight rod needs them to be
-        # regular, but while they relax they are no rotation of the flagellum and would spoil the fit.
+        # Least squares over node velocities relative to the anchor. Spins have a small weight: it keeps
+        # the system regular for a straight rod, while spins that only relax do not distort the fit.
         weight = real(0.01) * model.rod.segment_length[k] * model.rod.segment_length[k]
         matrix = mat33(real(0.0))
         moment = vec3(real(0.0))
@@ -250,7 +250,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def commit(model: DeviceModel, state: DeviceState, chart: Any) -> None:
-    """The placed state becomes the start of the next step, in cells where `commit` is set."""
+    """The present pose becomes the start of the next step, in cells where `commit` is set."""
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart]
     wp.launch(kernels.commit_elements, model.element_count, inputs=inputs, device=model.device)

@@ -4,7 +4,7 @@ Joint i couples segments i and i + 1 with tangents t, u and strain h Omega = (w1
 
     E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|e|/h - 1)^2
 
-(the paper's Kirchhoff density, eq. 4; its stretching term has no rest length as printed, here it has one). The motor
+(the paper's Kirchhoff density; its stretching term has no rest length as printed, here it has one). The motor
 joint 0 is a universal joint: no bending rigidity, no intrinsic twist, `hook_rigidity` in place of C. Directors follow
 a moving tangent by the minimal rotation, so gradients are taken with respect to segment vectors and spin angles.
 
@@ -62,9 +62,9 @@ def functions(p: Precision) -> SimpleNamespace:
         m2 = stiffness * (w2 - rest[1])
         m3 = model.rod.twist_rigidity[k] * per_length * (turned - rest[2])
         common = (real(0.5) * m3) * kb - ((m1 * w1 + m2 * w2) * per_chi) * (t + u)
-        lever = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
-        state.joint_before[e] = (common + wp.cross(u, lever)) / state.pose.length[e]
-        state.joint_after[e] = (common - wp.cross(t, lever)) / state.pose.length[e + 1]
+        weighted = ((a1 + b1) * m1 + (a2 + b2) * m2) * per_chi
+        state.joint_before[e] = (common + wp.cross(u, weighted)) / state.pose.length[e]
+        state.joint_after[e] = (common - wp.cross(t, weighted)) / state.pose.length[e + 1]
         state.joint_spin_before[e] = real(0.5) * (m1 * wp.dot(kb, a2) - m2 * wp.dot(kb, a1)) - m3
         state.joint_spin_after[e] = real(0.5) * (m1 * wp.dot(kb, b2) - m2 * wp.dot(kb, b1)) + m3
 

@@ -1,4 +1,4 @@
-"""Reconstruction of the pose from a chart's increments: bodies, anchors, nodes, and the frames between nodes."""
+"""Reconstruction of the pose from a chart's increments: bodies, anchors, nodes, tangents and directors."""
 
 import functools
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from warpflag_kernels.rod import rotations
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of one body, the anchor of one flagellum, one node, and one frame."""
+    """Device functions of one body, the anchor of one flagellum, one node, one segment."""
     real, vec3 = p.real, p.vec3
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     f, fd = rotations.functions(p), rotations.functions(p.double)
@@ -70,7 +70,10 @@ def functions(p: Precision) -> SimpleNamespace:
         state.pose.director[e] = director
 
     return SimpleNamespace(
-        body=reconstruct_body, anchor=reconstruct_anchor, node=reconstruct_node, frame=reconstruct_frame
+        reconstruct_body=reconstruct_body,
+        reconstruct_anchor=reconstruct_anchor,
+        reconstruct_node=reconstruct_node,
+        reconstruct_frame=reconstruct_frame,
     )
 
 
@@ -78,8 +81,8 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     f = functions(p)
-    reconstruct_body, reconstruct_anchor = f.body, f.anchor
-    reconstruct_node, reconstruct_frame = f.node, f.frame
+    reconstruct_body, reconstruct_anchor = f.reconstruct_body, f.reconstruct_anchor
+    reconstruct_node, reconstruct_frame = f.reconstruct_node, f.reconstruct_frame
     module = p.module("reconstruction")
 
     @wp.kernel(module=module)

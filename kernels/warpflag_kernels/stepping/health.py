@@ -1,10 +1,10 @@
 """Guards: finite values, strain, twist and fold of every joint, crossed centre lines.
 
-A step too long, or a load too strong, gives finite garbage long before it gives NaN. So at a start, every `interval`
-steps and where an advance ends, these kernels look at the state and note the first violated guard of the cell; the
-stepper then stops that cell. Crossings are found by following both segments of a near pair linearly from the last
-check to this one: where the four end points become coplanar, do the segments touch? Flagella without steric forces
-may pass through each other.
+A step too long, or a load too strong, gives wrong finite numbers long before it gives NaN. So at a start, every
+`interval` steps and at the end of an advance, these kernels check the state and record the first violated guard of
+each cell; the stepper then stops that cell. Crossings are found by moving both segments of a near pair linearly from
+the last check to this one: at the times when the four end points are coplanar, do the segments touch? Flagella without
+steric forces may pass through each other.
 """
 
 import functools
@@ -23,15 +23,18 @@ from warpflag_kernels.contact import contact_list, neighbours, search, steric
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
 
-LARGEST_STRAIN = 0.05
-LARGEST_TWIST = 0.5 * math.pi  # per joint [rad]
-SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
-LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
-ELEMENT_BITS = 26
+LARGEST_STRAIN = 0.05  # of a segment; 50 pN at the default stretching stiffness
+LARGEST_TWIST = (
+    0.5 * math.pi
+)  # per joint [rad]: beyond a quarter of a turn the discrete twist no longer resolves the rod
+SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours at more than 166 degrees; the curvature 2 tan(angle/2) diverges at 180
+LARGEST_TURN = 2.0  # of a motor in one step [rad]: angles of a step are added up, and are ambiguous from pi on
+TOUCH = 0.05  # distance at which crossing centre lines count as touching [sigma]
+ELEMENT_BITS = 26  # of a fault code: room for 67 million elements
 
 
 class Fault(IntEnum):
-    """What a guard found; the lower value is reported when several fire at once."""
+    """The kinds of faults; when several guards are violated at once, the lower value is reported."""
 
     NOT_FINITE = 0
     CROSSING = 1
@@ -43,7 +46,7 @@ class Fault(IntEnum):
 
 
 def encode(kind: Fault) -> int:
-    """The fault's kind in the upper bits of the code; the element is added below."""
+    """Fault code of a kind: the kind in the upper bits; the element is added in the lower ones."""
     return int(kind) << ELEMENT_BITS
 
 
@@ -54,7 +57,7 @@ def decode(code: int) -> tuple[Fault, int]:
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Guard`: what the last check saw."""
+    """The struct `Guard`: positions at the last check, and distances moved since."""
     real, vec3 = p.real, p.vec3
 
     @wp.struct
@@ -63,9 +66,9 @@ def struct(p: Precision) -> Any:
         # Empty where nothing can cross.
         position: wp.array(dtype=vec3)  # [E], at the last check [um]
         longest: wp.array(dtype=real)  # [K], its longest segment [um]
-        moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
-        strayed: wp.array(dtype=real)  # [K], from where contacts were looked for, by a stepper that does [um]
-        shifted: wp.array(dtype=real)  # [K], its longest way from where the lists of neighbours were built [um]
+        moved: wp.array(dtype=real)  # [K], largest displacement of a node since [um]
+        strayed: wp.array(dtype=real)  # [K], the same since the last search for contacts, if the stepper searches [um]
+        shifted: wp.array(dtype=real)  # [K], the same since the neighbour lists were built [um]
 
     return Guard
 
@@ -96,6 +99,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
+    touching = wp.constant(real(TOUCH))
     least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
     advanced = clock.functions().advanced
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
@@ -157,7 +161,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
-        """Whether two segments pass through each other while their ends move linearly to the new places."""
+        """Whether two segments pass through each other while their ends move linearly to new positions."""
         zero, one = real(0.0), real(1.0)
         # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign
         # before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
@@ -202,14 +206,19 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def met(state: State, guard: Guard, e: wp.int32, j: wp.int32, moved: real, touch: real):
-        """Whether segments e and j have passed through each other since the last look; no node has moved further."""
+        """Whether segments e and j have passed through each other since the last check.
+
+        Args:
+            moved: largest displacement of a node since [um].
+            touch: distance at which segments count as touching [um].
+        """
         away = middle(state, e) - middle(state, j)
         half = real(0.5) * state.pose.length[j]
         within = real(0.5) * state.pose.length[e] + half + touch
         reach = within + real(2.0) * moved
         if not (wp.dot(away, away) < reach * reach):
             return False
-        # No point of one has moved further against a point of the other than their ends have.
+        # The relative displacement of two points of the segments is at most that of their ends.
         p1n, q1n, p2n, q2n = (
             state.pose.position[e - 1],
             state.pose.position[e],
@@ -230,7 +239,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def farthest(model: Model, ways: wp.array(dtype=real), c: wp.int32):
-        """The longest of these ways of the flagella of cell c."""
+        """The largest of these displacements of the flagella of cell c."""
         longest = real(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -254,14 +263,14 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0 or chart.commit[c] == 0 or not due(control, guard, chart, c):
-            return  # a start has no earlier place to come from
+            return  # a start has no earlier check
         k = model.flagellum_of[e]
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
-        touch = real(0.05) * model.steric.diameter[c]
+        touch = touching * model.steric.diameter[c]
         moved = farthest(model, guard.moved, c)
-        # What can have met between the two looks is listed, if nothing has been far from where it was looked for: as a
-        # contact, or as a neighbour.
+        # A pair that can have met between the two checks is in the list of contacts, or in the neighbour lists, if no
+        # node has been too far from its position when the list was made.
         as_contact = bool(False)
         if wp.static(listing):
             strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
@@ -352,11 +361,12 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
 
 def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None) -> None:
-    """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
-    `fault`.
+    """Checks every start and every completed step that is due; records the first violated guard of a cell in `fault`.
 
     Args:
-        listed: contacts that have been looked for between the last look and this one, if any.
+        model, state: of the batch.
+        chart, guard, control: structs `Chart`, `Guard`, `Control`.
+        listed: struct `Contacts` of a search made between the last check and this one, if any.
     """
     p, listing = model.precision, listed is not None
     kernels = _kernels(p, listing)
@@ -371,7 +381,7 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
-    """Keeps the checked pose: the next check looks for crossings since then."""
+    """Stores the checked positions, from which the next check follows the segments."""
     if model.switches.has("steric"):
         inputs = [model.data, state.data, control, chart, guard]
         kernel = _kernels(model.precision, False).remember

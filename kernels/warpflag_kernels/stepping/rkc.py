@@ -4,11 +4,11 @@ Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increme
 
     Y_1 = m_1 dt F_0,     Y_j = mu_j Y_(j-1) + nu_j Y_(j-2) + m_j dt F_(j-1) + g_j dt F_0,     s stages.
 
-Every cell runs its own small state machine, one right-hand side per pass, so cells of a batch need not agree on
-step or stage count. Its `stage` says what this pass evaluates:
+Every cell has a stage counter of its own and evaluates one right-hand side per pass, so cells of a batch need not agree
+on step or number of stages. Its `stage` says what this pass evaluates:
 
     -1       the state itself, after a start or a change from outside
-     0       a probe next to it: one step of the power method for the spectral radius, which sets the stage count
+     0       a point near it, the probe: one iteration of the power method for the spectral radius, which sets s
      1..s    Y_j; the last one is the new state, and its right-hand side is the F_0 of the next step
 """
 
@@ -24,24 +24,29 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
+from warpflag_kernels.stepping import chebyshev as chebyshev_polynomials
 from warpflag_kernels.stepping import step_control
 from warpflag_kernels.stepping.step_control import StepControl
 
-DAMPING = 2.0 / 13.0
-# Norm of the probe: spins in rad, displacements in segment lengths.
+DAMPING = 2.0 / 13.0  # of the stability polynomial, as in the paper above
+STAGE_FACTOR = 1.54  # stages: 1 + (1 + 1.54 dt spectral radius)^1/2, as in the paper above
+# Norm of the probe, spins in rad, displacements in segment lengths: well above the root of
+# the unit round-off, at which truncation and round-off of a difference are alike; measured (docs/numerics.md).
 PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
-EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}
+EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last place of 1
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 SAFETY = 1.15
-FIRST_PROBES = 40
-NOISE = 20.0  # times the usual round-off of an error estimate, above which there is certainly more in it
-# A state this stiff is past saving: the step is taken, unstable, and the guards stop the cell.
-MOST_STAGES = 1.0e4
+FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
+# Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.01 to 0.8 of
+# what the accuracy allows (docs/numerics.md).
+ESTIMATE_SHARE = 0.1
+NOISE = 20.0  # an estimate below this times its usual round-off is taken to be round-off
+MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unstable, and the guards stop the cell
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Rkc`: earlier stages and the clockwork of every cell."""
+    """The struct `Rkc`: earlier stages of a step, the probe, and the stage counter of every cell."""
     real, vec4 = p.real, p.vec4
 
     @wp.struct
@@ -92,31 +97,19 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
-    advanced = clock.functions().advanced
+    advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
+    chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
     safety = wp.constant(wp.float64(SAFETY))
-    stage_factor = wp.constant(wp.float64(1.54))
+    weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
+    rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
+    stage_factor = wp.constant(wp.float64(STAGE_FACTOR))
     epsilon = wp.constant(real(EPSILON[p.name]))
     most_stages = wp.constant(wp.float64(MOST_STAGES))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
-
-    @wp.func(module=module)
-    def chebyshev(j: wp.int32, theta: wp.float64):
-        """T_j, T_j', T_j'' at cosh(theta)."""
-        n = wp.float64(j)
-        sh = wp.sinh(theta)
-        value = wp.cosh(n * theta)
-        slope = n * wp.sinh(n * theta) / sh
-        return wp.vec3d(value, slope, (n * n * value - wp.cosh(theta) * slope) / (sh * sh))
-
-    @wp.func(module=module)
-    def weight(j: wp.int32, theta: wp.float64):
-        """b_j; b_0 = b_1 = b_2."""
-        c = chebyshev(wp.max(j, 2), theta)
-        return c[2] / (c[1] * c[1])
 
     @wp.kernel(module=module)
     def schedule(
@@ -124,10 +117,10 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
-        rkc: Rkc,
         # Out:
+        control: Control,
+        rkc: Rkc,
         chart: Chart,
     ):
         c = wp.tid()
@@ -202,8 +195,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        rkc: Rkc,
         # Out:
+        rkc: Rkc,
         chart: Chart,
     ):
         e = wp.tid()
@@ -251,20 +244,19 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
-        # The embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step; a tenth of it,
-        # since it exceeds the errors found in runs ten to fifty times.
+        # A share of the embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step.
         dt = real(control.step[c])
         last = model.first_node[k + 1] - 1
         worst = real(0.0)
         while e <= last:
-            d = real(0.04) * dt * (rkc.start_rate[e] + chart.rate[e]) - real(0.08) * chart.increment[e]
+            d = rate_weight * dt * (rkc.start_rate[e] + chart.rate[e]) - increment_weight * chart.increment[e]
             worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
             e += 1
-        # Rates carry the round-off of positions times the stiffness of the stretch: below NOISE times the usual an
-        # estimate means nothing.
+        # Rates carry the round-off of positions times the stiffness of the stretch; below NOISE times that an estimate
+        # is taken to be round-off.
         reach = real(last - model.first_node[k]) * model.rod.segment_length[k]
         force = epsilon * reach * model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
-        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.drag.mobility_along[last] * force
+        rkc.noise[k] = noise_weight * dt * model.drag.mobility_along[last] * force
         rkc.error[k] = worst
 
     @wp.kernel(module=module)
@@ -332,9 +324,9 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
-        state: State,
         chart: Chart,
         # Out:
+        state: State,
         control: Control,
         rkc: Rkc,
     ):
@@ -366,7 +358,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
                 rkc.probes_left[c] = 1
                 rkc.stage[c] = 1
         elif j == rkc.stages[c]:
-            rkc.stage[c] = 1  # refused: again, shorter, from the same F_0
+            rkc.stage[c] = 1  # rejected: again, shorter, from the same F_0
         else:
             rkc.stage[c] = j + 1
 
@@ -385,14 +377,14 @@ def begin_pass(
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
-    inputs = [model.data, state.data, control, steps, rkc, chart]
+    inputs = [model.data, state.data, steps, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
 
 
 def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
-    """Estimates the error of every completed step and takes back `commit` where the step is refused."""
+    """Estimates the error of every completed step and clears `commit` where the step is rejected."""
     kernels = _kernels(model.precision, False)
     inputs = [model.data, state.data, control, chart, rkc]
     wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
@@ -401,9 +393,9 @@ def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, 
 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
-    """Keeps what later stages need and moves every cell's clockwork on."""
+    """Stores what later stages need and advances the stage counter of every cell."""
     kernels = _kernels(model.precision, euler)
     inputs = [model.data, state.data, chart, rkc]
     wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
-    inputs = [model.data, state.data, chart, control, rkc]
+    inputs = [model.data, chart, state.data, control, rkc]
     wp.launch(kernels.turn_over, model.cell_count, inputs=inputs, device=model.device)
