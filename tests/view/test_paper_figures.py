@@ -17,7 +17,7 @@ from warpflag.view import figures
 
 pytest.importorskip("matplotlib")
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "examples" / "paper"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "paper"))
 import insets
 import snapshots
 
