@@ -33,7 +33,7 @@ ENDING = """\
 | a page for a browser | `warpflag export DIR --to html`: one file, which loads nothing from outside |
 | Blender | `warpflag export DIR --to usd --mesh -o movie.usdc`, then `examples/blender.py` |
 | usdview, Omniverse | `movie.usdc` of the run directory, or `warpflag export DIR --to usd --color curvature` |
-| ParaView | `warpflag export DIR --to vtkhdf` |
+| ParaView, OVITO | `warpflag export DIR --to vtkhdf`, `--to xyz` |
 | notebooks | `examples/notebooks/`; a record at the end of a cell shows its page |
 
 Pictures are drawn by a ray caster of this package: it needs no display, no GPU and no further package, takes a third of

@@ -136,12 +136,12 @@ def _parser() -> argparse.ArgumentParser:
         "export", help="write a record in another format", description="Writes the record of a run in another format."
     )
     export.add_argument("directories", nargs="+", metavar="DIR", help="run directory; several make one USD movie")
-    export.add_argument("--to", choices=("usd", "html", "vtkhdf", "csv"), required=True, help="format")
+    export.add_argument("--to", choices=("usd", "html", "vtkhdf", "xyz", "csv"), required=True, help="format")
     export.add_argument(
         "-o",
         dest="output",
         metavar="FILE",
-        help="default: movie.usdc, cell.html, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
+        help="default: movie.usdc, cell.html or run.FORMAT in DIR; a movie may end in .usdc, .usda or .usdz",
     )
     export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
     export.add_argument("--mesh", action="store_true", help="a USD movie of meshes, for Blender")
@@ -256,8 +256,8 @@ def _export(options: argparse.Namespace) -> int:
     from warpflag.record import Record
     from warpflag.view import export, page, usd
 
-    names = {"usd": "movie.usdc", "html": "cell.html", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
-    path = Path(options.output or Path(options.directories[0]) / names[options.to])
+    name = {"usd": "movie.usdc", "html": "cell.html"}.get(options.to, f"run.{options.to}")
+    path = Path(options.output or Path(options.directories[0]) / name)
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
         return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
     if options.mesh and options.to != "usd":
@@ -270,7 +270,9 @@ def _export(options: argparse.Namespace) -> int:
         elif options.to == "html":
             page.write_page(records[0], path, options.color or "flagellum")
         else:
-            {"vtkhdf": export.write_vtkhdf, "csv": export.write_csv}[options.to](records[0], path)
+            {"vtkhdf": export.write_vtkhdf, "xyz": export.write_xyz, "csv": export.write_csv}[options.to](
+                records[0], path
+            )
     print(path)
     return DONE
 
