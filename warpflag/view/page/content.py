@@ -137,5 +137,8 @@ def _packed(values: Any, kind: str) -> str:
 
 
 def _numbers(values: Any, digits: int) -> list[float | None]:
-    """Numbers to some digits, None where there is none."""
+    """Numbers to some digits, 0 where they are nothing beside the largest, and None where there is none."""
+    values = np.asarray(values, float)
+    least = 1e-12 * np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+    values = np.where(np.abs(values) < least, 0.0, values)
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]

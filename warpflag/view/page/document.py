@@ -14,7 +14,7 @@ from warpflag.view.page.content import content
 __all__ = ["notebook_frame", "page_of", "write_page"]
 
 _NOTEBOOK_BYTES = 2 << 20
-_NOTEBOOK_HEIGHT = 620  # pixels
+_NOTEBOOK_HEIGHT = 740  # pixels
 
 
 def write_page(record: Record, path: str | Path, color_by: str = "flagellum", follow: bool = True) -> None:
