@@ -61,7 +61,7 @@ class Run:
     """What is drawn of a run.
 
     Attributes:
-        label: its name in a legend; empty where what differs between the runs is to tell.
+        label: its name in a legend; empty: the legend says what differs between the scenes.
         scene: the scene of the record.
         times: of the frames [ms], shape [frame_count].
         curves: the observables by name.
