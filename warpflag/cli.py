@@ -108,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         "--as",
         dest="kind",
         choices=("dashboard", "comparison"),
-        help="all that is known of one run, or several runs side by side (default: by the number of DIR)",
+        help="all curves of one run, or several runs in the same panels (default: by the number of DIR)",
     )
     plot.set_defaults(command=_plot)
 
