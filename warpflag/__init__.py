@@ -9,31 +9,66 @@ if TYPE_CHECKING:
     from warpflag.record import Record
     from warpflag.record.recorder import Recorder
     from warpflag.run.simulation import NumericalError, Simulation
-    from warpflag.scene import Scene, SceneError, load, with_values
+    from warpflag.scene.scene import (
+        Body,
+        External,
+        Flagella,
+        FlagellumOverride,
+        Fluid,
+        Hydrodynamics,
+        Motor,
+        Numerics,
+        Scene,
+        SceneError,
+        Start,
+        Steric,
+        load,
+        with_values,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
+    "Body",
+    "External",
+    "Flagella",
+    "FlagellumOverride",
+    "Fluid",
+    "Hydrodynamics",
+    "Motor",
     "NumericalError",
+    "Numerics",
     "Record",
     "Recorder",
     "Scene",
     "SceneError",
     "Simulation",
+    "Start",
+    "Steric",
     "__version__",
     "load",
     "with_values",
 ]
 
-# Loaded on first use, so that `import warpflag` and the command line's --help stay quick.
+# Where each name lives; loaded on first use, so that `import warpflag` and the command line's --help stay quick.
 _HOMES = {
+    "Body": "scene.scene",
+    "External": "scene.scene",
+    "Flagella": "scene.scene",
+    "FlagellumOverride": "scene.scene",
+    "Fluid": "scene.scene",
+    "Hydrodynamics": "scene.scene",
+    "Motor": "scene.scene",
     "NumericalError": "run.simulation",
+    "Numerics": "scene.scene",
     "Record": "record",
     "Recorder": "record.recorder",
-    "Scene": "scene",
-    "SceneError": "scene",
+    "Scene": "scene.scene",
+    "SceneError": "scene.scene",
     "Simulation": "run.simulation",
-    "load": "scene",
-    "with_values": "scene",
+    "Start": "scene.scene",
+    "Steric": "scene.scene",
+    "load": "scene.scene",
+    "with_values": "scene.scene",
 }
 
 
@@ -41,3 +76,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(importlib.import_module(f"warpflag.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'warpflag' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from warpflag.base.above import method_from
 from warpflag.scene import scene_file
 from warpflag.scene.sections import (
     Body,
@@ -104,6 +105,8 @@ class Scene(Section, key=""):
         self._check_sections()
         self._check_flagella()
         self._check_phases()
+
+    _repr_html_ = method_from("warpflag.view.scene_table", "scene_table", "Tables of the settings, for notebooks.")
 
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""
