@@ -51,7 +51,7 @@ def test_kappa_is_the_largest_eigenvalue_with_the_full_mobility(name, device, pr
 
 
 def test_over_implicitness_of_flexible_crowds_follows_kappa(device, precision):
-    """Above the limit kappa/2 by a fifth, never falling by more than 1.5 % at once; of one or two flagella the least."""
+    """Above the limit kappa/2 by a fifth, never falling by more than 1.5 % at once; for two flagella the least."""
     soft = {"flagella.bending_rigidity": 0.01, "flagella.twist_rigidity": 0.01, "flagella.stretching_stiffness": 1e3}
     scene = touching_cell({**BESIDE, **soft, "hydrodynamics.mode": "all"}, precision, 0.055)
     b = Bench(scene, shaken(scene, 1, node=1e-3, spin=0.05), device)
