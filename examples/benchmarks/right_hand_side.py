@@ -75,7 +75,7 @@ class Pass:
 
 def with_rkc(scene: Scene, precision: str) -> Scene:
     """The scene under the stepper whose pass is one right-hand side, in its default steps."""
-    values = {"numerics.stepper": "rkc", "numerics.time_step": None, "numerics.accuracy": None}
+    values = {"numerics.stepper": "rkc", "numerics.time_step": 1e-5, "numerics.accuracy": None}
     return with_values(scene, {**values, "numerics.precision": precision})
 
 

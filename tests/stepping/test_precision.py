@@ -73,3 +73,16 @@ def test_slow_motion_adds_up_in_float32(device):
         ends[precision] = sim.cell_state()
     turned = ends["float64"].motor_angle
     assert np.abs(ends["float32"].motor_angle - turned).max() < 0.02 * turned.max()
+
+
+def test_rkc_controls_its_steps_unless_told_otherwise(device):
+    """Water's drag in a fluid of a hundredth its viscosity: steps of 1e-5 s would be 0.1 um off, and say nothing."""
+    values = {"numerics.stepper": "rkc", "fluid.viscosity": 1e-5, "duration": 2e-4}
+    drag = {"fluid.drag_parallel": 1.6e-3, "fluid.drag_perpendicular": 2.8e-3, "fluid.drag_rotation": 1.26e-6}
+    ends = []
+    for own in ({}, {"numerics.accuracy": 1e-4}, {"numerics.time_step": 1e-5}):
+        sim = Simulation(with_values(ZIPPING, {**values, **drag, **own}), device=device)
+        sim.advance(1e-4)
+        ends.append(sim.state.positions)
+    errors = [np.linalg.norm(end - ends[1], axis=1).max() for end in ends]
+    assert errors[0] < 2 * 5e-3 * 0.1 < errors[2]

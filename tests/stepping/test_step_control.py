@@ -91,7 +91,8 @@ def test_a_rejected_step_leaves_no_trace(device):
     for name in ("time", "step", "positions", "directors", "motor_angle", "body_position", "body_orientation"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
     changed = {name for name, values in memory.items() if not np.array_equal(values, left[name])}
-    assert changed <= {"stepper.wanted_step", "stepper.rejected", "stepper.evaluations"}
+    measured = {f"stepper.{name}" for name in ("kappa", "strong", "probe_node", "probe_body", "over_implicit")}
+    assert changed <= {"stepper.wanted_step", "stepper.rejected", "stepper.evaluations"} | measured
 
 
 def test_after_a_jump_of_the_torque_a_restart_begins_small_and_follows(device):

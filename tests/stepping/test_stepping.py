@@ -142,7 +142,7 @@ def integrated(rows: np.ndarray, rate: Callable[[np.ndarray], np.ndarray], size:
 
 @pytest.mark.parametrize("stages", [2, 3, 10, 91, 300])
 def test_coefficients_are_those_of_a_stable_second_order_method(stages, device):
-    sim = Simulation(cell(), device=device)
+    sim = Simulation(cell({"numerics.time_step": 1e-6}), device=device)
     sim.advance(1e-6)
     rows, times = coefficients(sim, stages)
     # y' = (1, y_0): each stage knows its time, and from the second on integrates t exactly.
@@ -183,7 +183,7 @@ def test_steps_divide_the_way_evenly_and_end_on_the_target(stepper, device):
 
 
 def test_a_run_in_parts_equals_the_run_in_one(device):
-    scene = cell()
+    scene = cell({"numerics.time_step": 1e-5})
     whole, parts = (Simulation(scene, device=device) for _ in range(2))
     whole.advance(8e-5)
     for until in (3e-5, 4e-5, 7e-5, 8e-5):
@@ -247,7 +247,7 @@ def test_spectral_radius_is_that_of_the_dense_jacobian(stiffness, device, precis
 
 
 def test_stage_count_follows_the_stiffness_during_a_run(device):
-    scene = cell({"motor.torque": 1.0})
+    scene = cell({"motor.torque": 1.0, "numerics.time_step": 1e-5})
     sim = Simulation(scene, device=device)
     sim.advance(2e-5)
     hook = sim.system.model.data.rod.hook_rigidity

@@ -210,7 +210,7 @@ class Numerics(Section, key="numerics"):
         1e-9,
         1,
         "wanted node error per simulated ms",
-        derived="5e-3 with implicit; rkc takes fixed steps of 1e-5 s",
+        derived="5e-3, but euler takes fixed steps",
     )
     pair_precision: str = choice(
         "same",

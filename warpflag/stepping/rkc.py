@@ -13,12 +13,10 @@ from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import filament_mobility
-from warpflag.stepping.stepper import STEP_MEMORY, System, restart_step_control
+from warpflag.stepping.stepper import DEFAULT_ACCURACY, STEP_MEMORY, System, restart_step_control
 
-__all__ = ["EULER_STEPS_PER_CHECK", "RKC_STEP", "RkcStepper", "euler_step"]
+__all__ = ["EULER_STEPS_PER_CHECK", "RkcStepper", "euler_step"]
 
-RKC_STEP = 1.0e-5
-"""Default step of RKC [s]: node errors of about 1e-3 um after 1 ms of the zipping scene."""
 LONGEST_STEP = 1.0e-4
 """Longest step of RKC under accuracy control [s]."""
 EULER_STEPS_PER_CHECK = 100
@@ -44,7 +42,7 @@ class RkcStepper:
 
     Args:
         system: what to advance.
-        scenes: one per cell; `numerics.time_step` is the longest step, else the method's default.
+        scenes: one per cell; `numerics.time_step` fixes the step, else `numerics.accuracy` controls it.
         euler: explicit Euler, the oracle.
     """
 
@@ -52,11 +50,10 @@ class RkcStepper:
         self._system, self._euler = system, euler
         device = system.model.device
         self.data = rkc.allocate(system.model)
-        fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
-        accuracies = [0.0 if f else s.numerics.accuracy or 0.0 for f, s in zip(fixed, scenes, strict=True)]
+        fixed = [bool(s.numerics.time_step) or euler for s in scenes]
+        accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
         self.steps = step_control.allocate(accuracies, device)
-        longest = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
-        longest = [step if f else LONGEST_STEP for f, step in zip(fixed, longest, strict=True)]
+        longest = [s.numerics.time_step or (euler_step(s) if euler else LONGEST_STEP) for s in scenes]
         system.control.longest_step.assign(longest)
         system.guard.interval.fill_(EULER_STEPS_PER_CHECK if euler else 1)
         self._controlled = any(accuracies)
