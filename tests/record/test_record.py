@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from warpflag.record import Frame, Record, RecordError
-from warpflag.record import recorder as recorder_module
 from warpflag.record.recorder import Recorder
 
 FIRST_NODE = np.array([0, 4, 9])  # two flagella, of 3 and 4 segments
@@ -161,10 +160,9 @@ def test_reader_sees_committed_frames_of_a_run_that_goes_on(tmp_path):
     recorder.close()
 
 
-def test_slow_frames_are_committed_by_the_clock(tmp_path, monkeypatch):
+def test_slow_frames_are_committed_by_the_clock(tmp_path):
     now = [100.0]
-    monkeypatch.setattr(recorder_module.time, "monotonic", lambda: now[0])
-    recorder = started(tmp_path / "run.h5")
+    recorder = started(tmp_path / "run.h5", clock=lambda: now[0])
     recorder.write(frame(0))
     now[0] += 1.0
     recorder.write(frame(1))

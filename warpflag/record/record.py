@@ -1,89 +1,66 @@
-"""The record of a run, run.h5 (H5MD 1.1): its layout, its frames, and how to read it.
+"""Reads the record of a run, run.h5, whose layout `warpflag.record.layout` describes.
 
-Units um, pN, s, rad. Every entry but the parameters is a group of value, step and time, frames first:
-
-    /particles/flagella/position   [frame, node, 3]: lab axes [um], flagellum after flagellum, r_0..r_N each
-    /particles/flagella/e1         [frame, node, 3]: director e1 of motor tripod and segments, same order
-    /cell/motor_angle              [frame, flagellum]: tripod about m relative to the body, accumulated [rad]
-    /cell/body_position            [frame, 3]: centre of the body [um]
-    /cell/body_orientation         [frame, 4]: quaternion (x, y, z, w) from body to lab axes
-    /observables/NAME              [frame] or [frame, flagellum]
-    /parameters/scene, scene_sha256                          the scene text and its hash
-    /parameters/first_node                                   [flagellum_count + 1]: flagellum k has the nodes
-                                                             first_node[k] to first_node[k + 1] - 1
-    /parameters/filament_radius, body_length, body_width     [um]
-    /parameters/versions                                     attributes by name
-
-/cell and /parameters stay out of /particles, where readers of H5MD expect one group with per-node entries.
-All entries share one step and one time dataset (hard links). `step` is written last: its length is the number
-of committed frames, and everything else is cut to it.
+A damaged file gives a RecordError, never other numbers: every frame and the parameters are compared with their
+checksums as they are read. Records of versions that wrote no checksums are read without that comparison.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ENTRIES", "RECORD_NAME", "Frame", "FrameArray", "Record", "RecordError"]
+from warpflag.record.layout import (
+    BODY_ORIENTATION,
+    BODY_POSITION,
+    CHECKSUMS,
+    E1,
+    ENTRIES,
+    MOTOR_ANGLE,
+    PARAMETERS,
+    POSITION,
+    RECORD_NAME,
+    Frame,
+    RecordError,
+    checksum,
+    dataset_path,
+    one_line,
+    parameters_checksum,
+)
 
-RECORD_NAME = "run.h5"
-POSITION = "particles/flagella/position"
-E1 = "particles/flagella/e1"
-MOTOR_ANGLE = "cell/motor_angle"
-BODY_POSITION = "cell/body_position"
-BODY_ORIENTATION = "cell/body_orientation"
-ENTRIES = (POSITION, E1, MOTOR_ANGLE, BODY_POSITION, BODY_ORIENTATION)
-
-
-class RecordError(ValueError):
-    """A record that can't be read, written or continued; the message is one line that names the file."""
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One frame of a run, in lab coordinates.
-
-    time: [s]. step: number of steps taken when the frame was made. positions: nodes [um], shape [node_count,
-    3], flagellum after flagellum. directors: e1 of tripod and segments, shape [node_count, 3]. motor_angle:
-    of each tripod about its axis m relative to the body, accumulated [rad], shape [flagellum_count].
-    body_position: [um], shape [3]. body_orientation: quaternion (x, y, z, w) from body to lab axes, shape
-    [4]. observables: by name, a number or an array [flagellum_count] each.
-    """
-
-    time: float
-    step: int
-    positions: NDArray[np.floating]
-    directors: NDArray[np.floating]
-    motor_angle: NDArray[np.floating]
-    body_position: NDArray[np.floating]
-    body_orientation: NDArray[np.floating]
-    observables: dict[str, float | NDArray[np.floating]] = field(default_factory=dict)
+__all__ = ["FrameArray", "Record"]
 
 
-def dataset_path(name: str) -> str:
-    """Where the values of an entry lie; "step" and "time" are the datasets that all entries share."""
-    return f"{POSITION}/{name}" if name in ("step", "time") else f"{name}/value"
-
-
-def one_line(error: Exception) -> str:
-    """The message of an error of HDF5 on one line."""
-    return " ".join(str(error).split())
+@contextmanager
+def _reading(path: Path, what: str) -> Iterator[None]:
+    """Turns whatever HDF5 and h5py raise over a damaged file, which are errors of many kinds, into a RecordError."""
+    try:
+        yield
+    except RecordError:
+        raise
+    except Exception as error:
+        raise RecordError(f"{path}: {what}: {one_line(error)}") from error
 
 
 class FrameArray:
     """Frames of one quantity, read as they are indexed: a[i], a[10:20, :3], or np.asarray(a) for all.
 
-    shape: [frame_count, ...], the committed frames only.
+    Attributes:
+        shape: [frame_count, ...], the committed frames only.
     """
 
-    def __init__(self, dataset: Any, frame_count: int, path: Path):
+    def __init__(self, dataset: Any, sums: NDArray[np.uint32] | None, frame_count: int, path: Path, name: str):
         self._dataset = dataset
+        self._sums = sums
         self._path = path
+        self._name = name
         self.shape: tuple[int, ...] = (frame_count, *dataset.shape[1:])
 
     def __len__(self) -> int:
@@ -97,22 +74,36 @@ class FrameArray:
         if rows.size == 0:
             return np.empty(self.shape)[key]
         low = int(rows.min())
-        try:
-            block = self._dataset[low : int(rows.max()) + 1]
-        except OSError as error:
-            raise RecordError(f"{self._path}: frames can't be read: {one_line(error)}") from error
+        with _reading(self._path, "frames can't be read"):
+            block = np.asarray(self._dataset[low : int(rows.max()) + 1])
+            if len(block) != int(rows.max()) + 1 - low:
+                raise RecordError(f"{self._path}: is damaged: /{self._name} ends before frame {int(rows.max())}")
+        self._verify(block, low)
         return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[:], dtype=dtype)
 
+    def _verify(self, block: NDArray[Any], low: int) -> None:
+        if self._sums is None:
+            return
+        for index, (row, expected) in enumerate(zip(block, self._sums[low:], strict=False), low):
+            if checksum(row) != expected:
+                problem = f"frame {index} of /{self._name} does not agree with its checksum"
+                raise RecordError(f"{self._path}: is damaged: {problem}")
+
 
 class Record:
     """Reads run.h5, also while a run writes it or after one was killed: the frames committed by then.
 
-    path: the file, or the run directory that holds it. It is opened at the first access and stays open until
-    close() or the end of a `with` block. Raises RecordError where it is missing, damaged, or no record of
-    this program.
+    It is opened at the first access and stays open until close() or the end of a `with` block. Every access raises
+    RecordError where the file is damaged or no record of this program.
+
+    Args:
+        path: the file, or the run directory that holds it.
+
+    Raises:
+        RecordError: there is no such file.
     """
 
     def __init__(self, path: str | Path):
@@ -131,34 +122,80 @@ class Record:
     def close(self) -> None:
         """Closes the file, if it was opened."""
         if "_file" in self.__dict__:
-            self.__dict__.pop("_file").close()
+            with _reading(self.path, "can't be closed"):
+                self.__dict__.pop("_file").close()
 
     @cached_property
     def _file(self) -> Any:
         import h5py
 
-        try:
-            # Without a lock, or a run that is still writing would keep its readers out.
-            file = h5py.File(self.path, "r", locking=False)
-        except OSError as error:
-            # A file that this very process writes must be opened as it was, locked. Any other must not: the lock would
-            # keep its writer from opening it.
-            if "locking" not in str(error):
-                raise RecordError(f"{self.path}: not a readable HDF5 file: {one_line(error)}") from error
-            file = h5py.File(self.path, "r")
-        missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
-        if missing:
-            file.close()
-            raise RecordError(f"{self.path}: not a record of warpflag, it has no /{missing[0]}")
+        with _reading(self.path, "not a readable HDF5 file"):
+            try:
+                # Without a lock, or a run that is still writing would keep its readers out.
+                file = h5py.File(self.path, "r", locking=False)
+            except OSError as error:
+                # A file that this process has open with a lock can't be opened without.
+                if "locking" not in str(error):
+                    raise
+                file = h5py.File(self.path, "r")
+        with _reading(self.path, "is damaged"):
+            missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
+            if missing:
+                file.close()
+                raise RecordError(f"{self.path}: not a record of warpflag, it has no /{missing[0]}")
         return file
+
+    @cached_property
+    def entries(self) -> list[str]:
+        """Names of what is kept frame by frame: step, time, the entries, the observables, and checksums if it has any.
+
+        Their shapes are compared with each other and with the flagella when they are first looked at.
+        """
+        with _reading(self.path, "is damaged"):
+            observables = [f"observables/{name}" for name in self._file.get("observables", ())]
+            names = ["step", "time", *ENTRIES, *observables]
+            nodes, flagella = int(self.first_node[-1]), len(self.first_node) - 1
+            shapes = {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,)}
+            shapes |= {BODY_POSITION: (3,), BODY_ORIENTATION: (4,), "step": (), "time": ()}
+            frames = len(self._file[dataset_path("step")])
+            size = self.path.stat().st_size
+            for name in names:
+                dataset = self._file[dataset_path(name)]
+                allowed = [shapes[name]] if name in shapes else [(), (flagella,)]
+                fits = dataset.shape[1:] in allowed and dataset.dtype.kind == ("i" if name == "step" else "f")
+                if not fits or len(dataset) < frames or frames * dataset.dtype.itemsize > size:
+                    problem = f"/{dataset_path(name)} has the shape {dataset.shape}, type {dataset.dtype}"
+                    raise RecordError(f"{self.path}: is damaged: {problem} beside {frames} frames, {nodes} nodes")
+            if CHECKSUMS in self._file:
+                self._check_checksums(names, frames)
+                names.append(CHECKSUMS)
+        return names
+
+    def _check_checksums(self, names: list[str], frames: int) -> None:
+        sums = self._file[CHECKSUMS]
+        listed = [str(name) for name in sums.attrs["entries"]]
+        if sorted(listed) != sorted(names) or sums.shape[1:] != (len(names),) or len(sums) < frames:
+            raise RecordError(f"{self.path}: is damaged: /{CHECKSUMS} does not list the entries of the record")
 
     @cached_property
     def frame_count(self) -> int:
         """Number of committed frames when the record was first looked at."""
-        return len(self._file[dataset_path("step")])
+        with _reading(self.path, "is damaged"):
+            return len(self._file[dataset_path(self.entries[0])])
+
+    @cached_property
+    def _sums(self) -> dict[str, NDArray[np.uint32]]:
+        """Checksums of the committed frames by entry, shape [frame_count]; empty for a record without."""
+        if CHECKSUMS not in self.entries:
+            return {}
+        with _reading(self.path, "checksums can't be read"):
+            sums = self._file[CHECKSUMS]
+            return dict(zip(map(str, sums.attrs["entries"]), sums[: self.frame_count].T, strict=True))
 
     def _frames(self, name: str) -> FrameArray:
-        return FrameArray(self._file[dataset_path(name)], self.frame_count, self.path)
+        count, sums = self.frame_count, self._sums.get(name)
+        with _reading(self.path, "frames can't be read"):
+            return FrameArray(self._file[dataset_path(name)], sums, count, self.path, name)
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -182,8 +219,7 @@ class Record:
 
     @property
     def motor_angle(self) -> NDArray[np.float64]:
-        """Accumulated angles of the tripods relative to the body [rad], shape [frame_count,
-        flagellum_count]."""
+        """Accumulated angles of the tripods relative to the body [rad], shape [frame_count, flagellum_count]."""
         return self._frames(MOTOR_ANGLE)[:]
 
     @property
@@ -199,50 +235,77 @@ class Record:
     @property
     def observables(self) -> dict[str, NDArray[np.float64]]:
         """Observables by name, shape [frame_count] or [frame_count, flagellum_count]."""
-        names = self._file.get("observables", ())
-        return {name: self._frames(f"observables/{name}")[:] for name in names}
+        return {name: self._frames(f"observables/{name}")[:] for name in self._observable_names}
+
+    @property
+    def _observable_names(self) -> list[str]:
+        prefix = "observables/"
+        return [name.removeprefix(prefix) for name in self.entries if name.startswith(prefix)]
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """What /parameters holds: scene, scene_sha256, first_node, filament_radius, body_length, body_width, versions.
+
+        Lengths in um; first_node has the shape [flagellum_count + 1], versions maps names to versions.
+        """
+        with _reading(self.path, "is damaged: /parameters can't be read"):
+            group = self._file["parameters"]
+            if any(np.prod(group[name].shape, dtype=int) > self.path.stat().st_size for name in PARAMETERS):
+                raise RecordError(f"{self.path}: is damaged: /parameters is larger than the file")
+            found = {name: group[name][()] for name in PARAMETERS}
+            found |= {name: found[name].decode() for name in ("scene", "scene_sha256")}
+            found |= {name: float(found[name]) for name in ("filament_radius", "body_length", "body_width")}
+            found["first_node"] = np.asarray(found["first_node"]).astype(np.int64)
+            found["versions"] = {str(name): str(value) for name, value in group["versions"].attrs.items()}
+            expected = group.attrs.get("checksum")
+            sound = expected is None or int(expected) == parameters_checksum(found)
+            sound = sound and hashlib.sha256(found["scene"].encode()).hexdigest() == found["scene_sha256"]
+            bounds = found["first_node"].tolist()
+            if not sound or len(bounds) < 2 or bounds[0] != 0 or any(b - a < 2 for a, b in pairwise(bounds)):
+                raise RecordError(f"{self.path}: is damaged: /parameters does not agree with its checksum")
+        return found
 
     @property
     def first_node(self) -> NDArray[np.int64]:
         """Flagellum k has the nodes first_node[k] to first_node[k + 1] - 1; shape [flagellum_count + 1]."""
-        return self._parameter("first_node")
+        return self.parameters["first_node"]
 
     @property
     def scene_text(self) -> str:
         """The scene as TOML, every value written out."""
-        return self._parameter("scene").decode()
+        return self.parameters["scene"]
 
     @property
     def scene_sha256(self) -> str:
         """Hash of the scene text, hexadecimal."""
-        return self._parameter("scene_sha256").decode()
+        return self.parameters["scene_sha256"]
 
     @property
     def filament_radius(self) -> float:
         """Radius of the flagella [um]."""
-        return float(self._parameter("filament_radius"))
+        return self.parameters["filament_radius"]
 
     @property
     def body_length(self) -> float:
         """Length of the body over its round ends [um]."""
-        return float(self._parameter("body_length"))
+        return self.parameters["body_length"]
 
     @property
     def body_width(self) -> float:
         """Width of the body [um]."""
-        return float(self._parameter("body_width"))
+        return self.parameters["body_width"]
 
     @property
     def versions(self) -> dict[str, str]:
         """Versions that were given for the run, by name."""
-        return dict(self._file["parameters/versions"].attrs)
-
-    def _parameter(self, name: str) -> Any:
-        return self._file["parameters"][name][()]
+        return dict(self.parameters["versions"])
 
     def frame(self, index: int) -> Frame:
-        """One frame; a negative index counts from the end. Raises RecordError where there is no such
-        frame."""
+        """One frame; a negative index counts from the end.
+
+        Raises:
+            RecordError: there is no such frame, or it can't be read.
+        """
         if not -self.frame_count <= index < self.frame_count:
             raise RecordError(f"{self.path}: has no frame {index}, only {self.frame_count} frames")
         at = {name: self._frames(name)[index] for name in ("step", "time", *ENTRIES)}
@@ -254,7 +317,5 @@ class Record:
             motor_angle=at[MOTOR_ANGLE],
             body_position=at[BODY_POSITION],
             body_orientation=at[BODY_ORIENTATION],
-            observables={
-                name: self._frames(f"observables/{name}")[index] for name in self._file.get("observables", ())
-            },
+            observables={name: self._frames(f"observables/{name}")[index] for name in self._observable_names},
         )
