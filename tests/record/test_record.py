@@ -96,11 +96,11 @@ def test_file_is_h5md(tmp_path):
     with h5py.File(written(tmp_path / "run.h5", 12)) as file:
         np.testing.assert_array_equal(file["h5md"].attrs["version"], [1, 1])
         assert "name" in file["h5md/author"].attrs
-        assert file["h5md/creator"].attrs["name"] == "warpflag"
-        assert file["h5md/creator"].attrs["version"] == "1.2.3"
+        assert file["h5md/creator"].attrs["name"] == b"warpflag"
+        assert file["h5md/creator"].attrs["version"] == b"1.2.3"
         assert list(file["particles"]) == ["flagella"]
         box = file["particles/flagella/box"].attrs
-        assert box["dimension"] == 3 and list(box["boundary"]) == ["none"] * 3
+        assert box["dimension"] == 3 and list(box["boundary"]) == [b"none"] * 3
         for entry in ENTRIES:
             assert set(file[entry]) == {"value", "step", "time"}, entry
             assert len(file[entry]["value"]) == 12

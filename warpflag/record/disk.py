@@ -57,6 +57,12 @@ class DiskFile:
                 os.ftruncate(self._descriptor, present)
             raise DiskError.of(self.path, error) from error
 
+    def trim(self, size: int) -> None:
+        """Gives back what was reserved beyond `size` bytes; call it once HDF5 has closed the file."""
+        with contextlib.suppress(OSError):
+            if os.fstat(self._descriptor).st_size > size:
+                os.ftruncate(self._descriptor, size)
+
     def sync(self) -> None:
         """Returns once everything written so far would survive a power cut.
 

@@ -51,6 +51,8 @@ __all__ = [
     "dataset_path",
     "one_line",
     "parameters_checksum",
+    "summed_entries",
+    "text_of",
 ]
 
 RECORD_NAME = "run.h5"
@@ -112,6 +114,16 @@ def parameters_checksum(parameters: Mapping[str, Any]) -> int:
     plain = {name: np.asarray(parameters[name]).tolist() for name in PARAMETERS}
     plain["versions"] = {str(name): str(value) for name, value in parameters["versions"].items()}
     return zlib.crc32(json.dumps(plain, sort_keys=True).encode())
+
+
+def summed_entries(checksums: Any) -> list[str]:
+    """The entries whose checksums the columns of the dataset /checksums hold."""
+    return [text_of(name) for name in checksums.attrs["entries"]]
+
+
+def text_of(value: Any) -> str:
+    """A text from HDF5, where it is bytes or, in attributes of variable length, a text already."""
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def one_line(error: BaseException) -> str:

@@ -33,6 +33,8 @@ from warpflag.record.layout import (
     dataset_path,
     one_line,
     parameters_checksum,
+    summed_entries,
+    text_of,
 )
 
 __all__ = ["FrameArray", "Record"]
@@ -173,7 +175,7 @@ class Record:
 
     def _check_checksums(self, names: list[str], frames: int) -> None:
         sums = self._file[CHECKSUMS]
-        listed = [str(name) for name in sums.attrs["entries"]]
+        listed = summed_entries(sums)
         if sorted(listed) != sorted(names) or sums.shape[1:] != (len(names),) or len(sums) < frames:
             raise RecordError(f"{self.path}: is damaged: /{CHECKSUMS} does not list the entries of the record")
 
@@ -190,7 +192,7 @@ class Record:
             return {}
         with _reading(self.path, "checksums can't be read"):
             sums = self._file[CHECKSUMS]
-            return dict(zip(map(str, sums.attrs["entries"]), sums[: self.frame_count].T, strict=True))
+            return dict(zip(summed_entries(sums), sums[: self.frame_count].T, strict=True))
 
     def _frames(self, name: str) -> FrameArray:
         count, sums = self.frame_count, self._sums.get(name)
@@ -253,10 +255,10 @@ class Record:
             if any(np.prod(group[name].shape, dtype=int) > self.path.stat().st_size for name in PARAMETERS):
                 raise RecordError(f"{self.path}: is damaged: /parameters is larger than the file")
             found = {name: group[name][()] for name in PARAMETERS}
-            found |= {name: found[name].decode() for name in ("scene", "scene_sha256")}
+            found |= {name: text_of(found[name]) for name in ("scene", "scene_sha256")}
             found |= {name: float(found[name]) for name in ("filament_radius", "body_length", "body_width")}
             found["first_node"] = np.asarray(found["first_node"]).astype(np.int64)
-            found["versions"] = {str(name): str(value) for name, value in group["versions"].attrs.items()}
+            found["versions"] = {name: text_of(value) for name, value in group["versions"].attrs.items()}
             expected = group.attrs.get("checksum")
             sound = expected is None or int(expected) == parameters_checksum(found)
             sound = sound and hashlib.sha256(found["scene"].encode()).hexdigest() == found["scene_sha256"]

@@ -35,6 +35,7 @@ from warpflag.record.layout import (
     dataset_path,
     one_line,
     parameters_checksum,
+    summed_entries,
 )
 from warpflag.record.record import Record
 
@@ -47,6 +48,9 @@ _CHUNK_BYTES = 1 << 20
 # grows, and what it allocates ahead for all of them together.
 _TREE_BYTES = 3 * 4096
 _SLACK_BYTES = 4096
+# The format of HDF5 1.8: groups and headers of datasets carry a checksum. Later formats mark a file as open while it
+# is written, and one whose writer was killed can't be opened again.
+_FORMAT = ("v108", "v108")
 
 
 class Recorder:
@@ -214,7 +218,10 @@ class Recorder:
         self._datasets = {}
         try:
             if file is not None:
+                size = file.id.get_filesize()
                 file.close()
+                if disk is not None:
+                    disk.trim(size)
         finally:
             if disk is not None:
                 disk.close()
@@ -258,15 +265,17 @@ class Recorder:
         for name, shape in expected.items():
             if np.shape(values[name]) != shape:
                 raise ValueError(f"{name} of a frame has shape {np.shape(values[name])}, the scene's is {shape}")
-        with h5py.File(f"{self.path}.new", "w", driver="core", backing_store=False) as file:
+        with h5py.File(
+            f"{self.path}.new", "w", driver="core", backing_store=False, block_size=4096, libver=_FORMAT
+        ) as file:
             file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
-            file.create_group("h5md/author").attrs["name"] = "unknown"
+            file.create_group("h5md/author").attrs["name"] = _text("unknown")
             creator = file.create_group("h5md/creator")
-            creator.attrs["name"] = "warpflag"
-            creator.attrs["version"] = self._parameters["versions"].get("warpflag", "unknown")
+            creator.attrs["name"] = _text("warpflag")
+            creator.attrs["version"] = _text(self._parameters["versions"].get("warpflag", "unknown"))
             box = file.create_group("particles/flagella/box")
             box.attrs["dimension"] = np.int32(3)
-            box.attrs["boundary"] = ["none"] * 3
+            box.attrs["boundary"] = np.array([_text("none")] * 3)
             # The shared datasets first, under the entry that every record has.
             for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
                 _add_dataset(file, name, np.shape(values[name]), np.dtype(np.int64 if name == "step" else np.float64))
@@ -274,7 +283,7 @@ class Recorder:
                 file[f"{name}/step"] = file[dataset_path("step")]
                 file[f"{name}/time"] = file[dataset_path("time")]
             sums = _add_dataset(file, CHECKSUMS, (len(values),), np.dtype(np.uint32))
-            sums.attrs["entries"] = list(values)
+            sums.attrs["entries"] = np.array([_text(name) for name in values])
             _add_parameters(file, self._parameters)
             file.flush()
             return file.id.get_file_image()
@@ -305,11 +314,11 @@ class Recorder:
         import h5py
 
         self._disk = disk
-        self._file = h5py.File(self.path, "r+", locking=False)
+        self._file = h5py.File(self.path, "r+", locking=False, libver=_FORMAT)
         self._datasets = {name: self._file[dataset_path(name)] for name in names}
         self._shapes = {name: tuple(dataset.shape[1:]) for name, dataset in self._datasets.items()}
         if CHECKSUMS in self._datasets:
-            self._summed = [str(name) for name in self._datasets[CHECKSUMS].attrs["entries"]]
+            self._summed = summed_entries(self._datasets[CHECKSUMS])
 
     def _with_new_parameters(self, disk: DiskFile) -> DiskFile:
         """Replaces the file by a copy with the parameters of this run: they are changed all together or not at all.
@@ -327,7 +336,7 @@ class Recorder:
             shutil.copyfile(self.path, temporary)
             changed = DiskFile(temporary)
             changed.reserve(os.path.getsize(temporary) + len(self._parameters["scene"]) + (1 << 16))
-            with h5py.File(temporary, "r+", locking=False) as file:
+            with h5py.File(temporary, "r+", locking=False, libver=_FORMAT) as file:
                 del file["parameters"]
                 _add_parameters(file, self._parameters)
             changed.sync()
@@ -355,10 +364,15 @@ def _add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
     group = file.create_group("parameters")
     for name, value in parameters.items():
         if name == "versions":
-            group.create_group(name).attrs.update(value)
+            group.create_group(name).attrs.update({key: _text(version) for key, version in value.items()})
         else:
-            group[name] = value
+            group[name] = _text(value) if isinstance(value, str) else value
     group.attrs["checksum"] = np.uint32(parameters_checksum(parameters))
+
+
+def _text(text: str) -> np.bytes_:
+    """A text of fixed length: HDF5 does not return from reading a damaged heap of texts of variable length."""
+    return np.bytes_(text.encode())
 
 
 def _values(frame: Frame) -> dict[str, Any]:
