@@ -20,7 +20,10 @@ class DiskError(OSError):
     @classmethod
     def of(cls, path: str | Path, error: BaseException) -> DiskError:
         """The error for a file at `path` that could not be written because of `error`."""
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else " ".join(str(error).split())
+        if isinstance(error, OSError) and error.errno:
+            reason = os.strerror(error.errno)
+        else:
+            reason = " ".join(str(error).split())
         return cls(f"{path}: can't be written: {reason}")
 
 

@@ -57,6 +57,12 @@ class DiskFile:
                 os.ftruncate(self._descriptor, present)
             raise DiskError.of(self.path, error) from error
 
+    def extend(self, size: int) -> None:
+        """Makes the file `size` bytes long, if it can: HDF5 opens no file that is shorter than its header says."""
+        with contextlib.suppress(OSError):
+            if os.fstat(self._descriptor).st_size < size:
+                os.ftruncate(self._descriptor, size)
+
     def trim(self, size: int) -> None:
         """Gives back what was reserved beyond `size` bytes; call it once HDF5 has closed the file."""
         with contextlib.suppress(OSError):

@@ -44,10 +44,8 @@ __all__ = ["Recorder"]
 _BLOCK_FRAMES = 10
 _BLOCK_SECONDS = 2.0
 _CHUNK_BYTES = 1 << 20
-# Bytes that HDF5 takes at most beside the chunks themselves: three nodes of the tree of chunks for a dataset that
-# grows, and what it allocates ahead for all of them together.
-_TREE_BYTES = 3 * 4096
-_SLACK_BYTES = 4096
+_SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
+_TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
 # The format of HDF5 1.8: groups and headers of datasets carry a checksum. Later formats mark a file as open while it
 # is written, and one whose writer was killed can't be opened again.
 _FORMAT = ("v108", "v108")
@@ -135,6 +133,7 @@ class Recorder:
         values = _values(frame)
         if self._file is None:
             self._create(values)
+            return
         shapes = {name: np.shape(value) for name, value in values.items()}
         expected = {name: shape for name, shape in self._shapes.items() if name != CHECKSUMS}
         if shapes != expected:
@@ -187,7 +186,7 @@ class Recorder:
                     dataset.resize(count, axis=0)
                     dataset[self._committed :] = rows[name]
                 self._file.flush()
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
             raise DiskError.of(self.path, error) from error
         self._committed = count
@@ -199,16 +198,24 @@ class Recorder:
         total = _SLACK_BYTES
         for dataset in self._datasets.values():
             chunk = dataset.chunks
-            added = -(-count // chunk[0]) - -(-self._committed // chunk[0])
-            if added > 0:
-                total += added * int(np.prod(chunk)) * dataset.dtype.itemsize + _TREE_BYTES * (1 + added // 16)
+            before, after = (-(-frames // chunk[0]) for frames in (self._committed, count))
+            if after > before:
+                node = 24 + 8 * _TREE_FANOUT + (_TREE_FANOUT + 1) * 8 * (len(chunk) + 2)
+                # A full node is split, and so may be those above it.
+                nodes = 3 + (after - before) // 16 if after > _TREE_FANOUT else int(before == 0)
+                total += (after - before) * int(np.prod(chunk)) * dataset.dtype.itemsize + nodes * node
         return total
 
     def _abandon(self) -> None:
         """Closes HDF5's file after a write that failed; what it still writes goes nowhere, and can't fail again."""
-        with contextlib.suppress(Exception), open(os.devnull, "r+b") as nowhere:
-            os.dup2(nowhere.fileno(), self._file.id.get_vfd_handle())
         self._pending = []
+        with contextlib.suppress(Exception):
+            size = self._file.id.get_filesize()
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(nowhere, self._file.id.get_vfd_handle())
+            os.close(nowhere)
+            if self._disk is not None:
+                self._disk.extend(size)
         with contextlib.suppress(Exception):
             self._release()
 
@@ -231,14 +238,14 @@ class Recorder:
             raise RecordError(f"{self.path}: exists already")
 
     def _create(self, values: dict[str, Any]) -> None:
-        """Makes the file without frames, in memory first, and then under a temporary name: it is never there in part.
+        """Makes the file with its first frame, in memory and then under a temporary name: it is never there in part.
 
         Raises:
             RecordError: the file exists.
             DiskError: it could not be written; there is none then.
         """
         self._refuse_existing()
-        image = self._empty_image(values)
+        image = self._image(values)
         temporary = self.path.with_name(self.path.name + ".tmp")
         try:
             with open(temporary, "wb") as file:
@@ -251,9 +258,10 @@ class Recorder:
                 temporary.unlink()
             raise DiskError.of(self.path, error) from error
         self._open(DiskFile(self.path), [*values, CHECKSUMS])
+        self._committed, self._last_commit = 1, self._clock()
 
-    def _empty_image(self, values: dict[str, Any]) -> bytes:
-        """The bytes of a record without frames, for frames of the shapes of `values`."""
+    def _image(self, values: dict[str, Any]) -> bytes:
+        """The bytes of a record of one frame."""
         import h5py
 
         first_node = self._parameters["first_node"]
@@ -278,11 +286,12 @@ class Recorder:
             box.attrs["boundary"] = np.array([_text("none")] * 3)
             # The shared datasets first, under the entry that every record has.
             for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
-                _add_dataset(file, name, np.shape(values[name]), np.dtype(np.int64 if name == "step" else np.float64))
+                _add_dataset(file, name, values[name])
             for name in values.keys() - {"step", "time", POSITION}:
                 file[f"{name}/step"] = file[dataset_path("step")]
                 file[f"{name}/time"] = file[dataset_path("time")]
-            sums = _add_dataset(file, CHECKSUMS, (len(values),), np.dtype(np.uint32))
+            first = np.array([checksum(value) for value in values.values()], dtype=np.uint32)
+            sums = _add_dataset(file, CHECKSUMS, first)
             sums.attrs["entries"] = np.array([_text(name) for name in values])
             _add_parameters(file, self._parameters)
             file.flush()
@@ -304,7 +313,7 @@ class Recorder:
             for name in ["step", *(name for name in names if name != "step")]:  # at no moment is a dataset shorter
                 self._datasets[name].resize(self._committed, axis=0)
                 self._file.flush()
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
             raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
         self._last_commit = self._clock()
@@ -352,12 +361,12 @@ class Recorder:
         return changed
 
 
-def _add_dataset(file: Any, name: str, shape: tuple[int, ...], dtype: np.dtype) -> Any:
-    """An empty dataset that grows by frames of this shape, in chunks of 16 to 64 frames."""
-    frame_bytes = dtype.itemsize * max(1, int(np.prod(shape, dtype=int)))
-    chunk = int(np.clip(_CHUNK_BYTES // frame_bytes, 16, 64))
-    path = dataset_path(name)
-    return file.create_dataset(path, (0, *shape), dtype, maxshape=(None, *shape), chunks=(chunk, *shape))
+def _add_dataset(file: Any, name: str, value: Any) -> Any:
+    """A dataset of frames whose first is `value`, in chunks of 16 to 64 frames."""
+    first = np.asarray(value)[None]
+    chunk = int(np.clip(_CHUNK_BYTES // max(1, first.nbytes), 16, 64))
+    shape = first.shape[1:]
+    return file.create_dataset(dataset_path(name), data=first, maxshape=(None, *shape), chunks=(chunk, *shape))
 
 
 def _add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
