@@ -1,0 +1,82 @@
+"""Streams that can't be written to: what is said to them is lost, and nothing else."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from warpflag.base.progress import Progress
+from warpflag.base.streams import is_terminal, say
+
+
+def closed() -> io.TextIOWrapper:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
+    stream.close()
+    return stream
+
+
+def without_reader() -> io.TextIOWrapper:
+    reader, writer = os.pipe()
+    os.close(reader)
+    return os.fdopen(writer, "w")
+
+
+def full() -> io.TextIOWrapper:
+    return open("/dev/full", "w")
+
+
+BROKEN = [closed, without_reader, pytest.param(full, marks=pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no such device"))]  # fmt: skip
+
+
+def let_go(stream: io.TextIOWrapper) -> None:
+    """Closes a broken stream without the error that its unwritten text would raise."""
+    try:
+        stream.close()
+    except (OSError, ValueError):
+        pass
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_progress_goes_on_in_silence_where_its_stream_is_broken(broken):
+    stream = broken()
+    assert not is_terminal(stream) and not say("a line\n", stream)
+    now = [0.0]
+    progress = Progress(1e-3, stream, clock=lambda: now[0])
+    for step in range(4):
+        now[0] += 3.0
+        progress.update(1e-4 * step)
+    progress.close()
+    let_go(stream)
+
+
+def test_what_a_stream_can_not_encode_is_escaped():
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding="ascii", errors="strict")
+    assert say("22 µm/s\n", stream)
+    assert raw.getvalue() == rb"22 \xb5m/s" + b"\n"
+
+
+SCRIPT = """
+from warpflag.base.device import start_warp
+from warpflag.base.progress import Progress
+start_warp()
+progress = Progress(1.0, clock=iter(range(0, 1000, 10)).__next__)
+for step in range(5):
+    progress.update(0.2 * step)
+progress.close()
+open({path!r}, "w").write("reached the end")
+"""
+
+
+@pytest.mark.parametrize("redirection", ["2>&-", "2>/dev/full", "2>&1 | true"])
+def test_a_process_with_a_broken_standard_error_reaches_its_end(tmp_path, redirection):
+    script, end = tmp_path / "script.py", tmp_path / "end"
+    script.write_text(SCRIPT.format(path=str(end)))
+    command = f"'{sys.executable}' '{script}' {redirection}"
+    subprocess.run(["bash", "-c", command], cwd=Path(__file__).parents[2], check=False, timeout=120)
+    assert end.read_text() == "reached the end"
