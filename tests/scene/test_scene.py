@@ -177,11 +177,6 @@ def test_bounds_are_inclusive_and_hold(cls, name):
     for wrong in (math.nan, math.inf, True, "3", [3.0], b"3"):
         with pytest.raises(SceneError):
             make(cls, name, wrong)
-    if setting.smallest:
-        make(cls, name, 0.0)
-        make(cls, name, -setting.smallest)
-        with pytest.raises(SceneError):
-            make(cls, name, 0.99 * setting.smallest)
 
 
 @pytest.mark.parametrize(
@@ -207,9 +202,9 @@ def test_extremes_that_a_stability_study_needs_are_allowed(key, value):
 
 @pytest.mark.parametrize(("cls", "name"), SETTINGS)
 def test_docstrings_tell_every_setting(cls, name):
-    assert f"- {name} = " in cls.__doc__
-    assert cls.settings[name].meaning in cls.__doc__
-    assert cls.settings[name].bounds in cls.__doc__
+    line = next(line for line in cls.__doc__.splitlines() if line.startswith(f"        {name}: "))
+    assert cls.settings[name].meaning in line and cls.settings[name].bounds in line
+    assert line.endswith(".") and ("; default " in line or "; required" in line)
 
 
 def test_defaults_are_the_papers(tmp_path):

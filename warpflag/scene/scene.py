@@ -1,7 +1,7 @@
 """What is simulated: a bacterium, its flagella, the fluid, and which terms of the model act.
 
-A scene is made from a file by :func:`load` or in Python, and is checked when it is made: one that can't be
-simulated raises :class:`SceneError`. Units are um, pN, s; angles are in degrees.
+A scene is made from a file by `load` or in Python, and is checked when it is made: one that can't be simulated raises
+`SceneError`. Units are um, pN, s; angles are in degrees.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from warpflag.scene import scene_file
+from warpflag.scene.errors import Problems, SceneError, written
 from warpflag.scene.sections import (
     Body,
     Flagella,
@@ -26,7 +27,7 @@ from warpflag.scene.sections import (
     Start,
     Steric,
 )
-from warpflag.scene.settings import SceneError, Section, Setting, integer, number, text, written
+from warpflag.scene.settings import Section, Setting, integer, number, text
 
 __all__ = [
     "Body",
@@ -49,9 +50,18 @@ __all__ = [
 
 @dataclass(frozen=True)
 class FlagellumSpec:
-    """One flagellum with every choice resolved. Angles in deg, lengths in um, torque in pN um.
+    """One flagellum with every choice resolved.
 
-    phase is None where the initial shape chooses it (see Flagella.phase_difference).
+    Attributes:
+        azimuth: of the anchor about e_b3, counted from e_b1 [deg].
+        anchor_offset: distance of the anchor from the body's middle toward the rear [um].
+        motor_axis_angle: of the motor axis to e_b3, toward the outward normal [deg].
+        tilt: of the helix axis to e_b3, toward the outward normal [deg].
+        torque: of the motor about its axis [pN um].
+        length: of the contour [um].
+        segment_count: number of segments.
+        phase: angle of the anchor about the helix axis [deg]; None where the initial shape chooses it (see
+            Flagella.phase_difference).
     """
 
     azimuth: float
@@ -73,8 +83,8 @@ class FlagellumSpec:
 class Scene(Section, key=""):
     """Everything that a run depends on.
 
-    Sections are attributes of the same names as in a scene file; ``flagellum`` holds either nothing or
-    one override per flagellum. Raises SceneError for values that exclude each other.
+    Sections are attributes of the same names as in a scene file; `flagellum` holds either nothing or
+    one override per flagellum. Values that exclude each other raise SceneError, like values out of range.
     """
 
     name: str = text(
@@ -98,9 +108,14 @@ class Scene(Section, key=""):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "flagellum", tuple(self.flagellum))
-        self._check_sections()
-        self._check_flagella()
-        self._check_phases()
+        problems = Problems()
+        for check in (self._check_body, self._check_step, self._check_pair_radius, self._check_start):
+            with problems.gathered():
+                check()
+        self._check_flagella(problems)
+        with problems.gathered():
+            self._check_phases()
+        problems.raise_any()
 
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""
@@ -122,34 +137,52 @@ class Scene(Section, key=""):
             )
         return tuple(specs)
 
-    def _check_sections(self) -> None:
+    def _check_body(self) -> None:
         if self.body.width > self.body.length:
             problem = f"must not be above body.length = {self.body.length:g} um"
             raise SceneError("body.width", self.body.width, problem, ["body.length"])
+
+    def _check_step(self) -> None:
         step = self.numerics.time_step
         if step is not None and step > self.duration:
             problem = f"must not be above duration = {self.duration:g} s"
             raise SceneError("numerics.time_step", step, problem, ["duration"])
+
+    def _check_pair_radius(self) -> None:
         radius, mode = self.hydrodynamics.pair_radius, self.hydrodynamics.mode
         if radius is not None and mode in ("none", "as_printed"):
             why = "sums no pairs" if mode == "none" else "takes flagella.filament_radius"
             problem = f"must be absent: hydrodynamics.mode = {mode} {why}"
             raise SceneError("hydrodynamics.pair_radius", radius, problem, ["hydrodynamics.mode"])
+
+    def _check_start(self) -> None:
         if self.start.record is None and self.start.frame != -1:
             raise SceneError("start.frame", self.start.frame, "needs start.record, which is absent")
 
-    def _check_flagella(self) -> None:
+    def _check_flagella(self, problems: Problems) -> None:
         if self.flagellum and len(self.flagellum) != self.flagella.count:
             problem = f"must be {len(self.flagellum)}, the number of [[flagellum]] tables, or absent"
-            raise SceneError("flagella.count", self.flagella.count, problem)
+            with problems.gathered():
+                raise SceneError("flagella.count", self.flagella.count, problem)
+            return
         anchors: dict[tuple[float, float], int] = {}
+        told: set[str | None] = set()  # a value of the group is at fault once, not for every flagellum
         for k, spec in enumerate(self.resolved_flagella()):
-            self._check_segments(k, spec)
-            self._check_anchor(k, spec)
+            if problems.full():
+                return
+            for check in (self._check_segments, self._check_anchor):
+                try:
+                    check(k, spec)
+                except SceneError as error:
+                    if error.key not in told:
+                        told.add(error.key)
+                        with problems.gathered():
+                            raise
             place = (round(spec.azimuth % 360.0, 9), spec.anchor_offset)
             if self.steric.enabled and anchors.setdefault(place, k) != k:
                 problem = f"puts flagellum {k} on the anchor of flagellum {anchors[place]}"
-                raise SceneError(f"flagellum.{k}.azimuth", spec.azimuth, problem)
+                with problems.gathered():
+                    raise SceneError(f"flagellum.{k}.azimuth", spec.azimuth, problem)
 
     def _check_segments(self, k: int, spec: FlagellumSpec) -> None:
         key, value = "flagella.segment_length", self.flagella.segment_length
@@ -169,7 +202,7 @@ class Scene(Section, key=""):
 
     def _check_anchor(self, k: int, spec: FlagellumSpec) -> None:
         cylinder = (self.body.length - self.body.width) / 2
-        if abs(spec.anchor_offset) > cylinder + 1e-9:
+        if 0 <= cylinder < abs(spec.anchor_offset) - 1e-9:
             own = self.flagellum and self.flagellum[k].anchor_offset is not None
             key = f"flagellum.{k}.anchor_offset" if own else "flagella.anchor_offset"
             problem = f"is beyond the cylinder part of the body, {-cylinder:g} to {cylinder:g} um"
@@ -202,14 +235,21 @@ _KEYS: dict[str, Setting] = {
 
 
 def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) -> Scene:
-    """Read a scene file.
+    """Reads a scene file. A file without a name gets its own file name.
 
-    overrides: values that replace the file's, as ``key=value`` texts or as a mapping from dotted key to
-    value; flagellum k (from 0) has keys ``flagellum.k.torque`` and so on. A file without a name gets its
-    own file name. Raises SceneError, which names the file and the key.
+    Args:
+        path: the file.
+        overrides: values that replace the file's, as texts key=value or as a mapping from dotted key to value;
+            flagellum k (from 0) has keys `flagellum.k.torque` and so on.
+
+    Raises:
+        SceneError: the scene can't be simulated; it names the file and the keys.
     """
     given = scene_file.read_overrides(overrides)
-    values, tables = scene_file.flattened(scene_file.read_toml(Path(path)), _SECTIONS)
+    try:
+        values, tables = scene_file.flattened(scene_file.read_toml(Path(path)), _SECTIONS)
+    except SceneError as error:
+        raise (error if error.source else error.located(path)) from None
     values.setdefault("name", re.sub(r"[^\w.+-]+", "-", Path(path).stem).strip("-.+") or "scene")
     try:
         return _built({**values, **given}, tables)
@@ -218,12 +258,24 @@ def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) ->
 
 
 def loads(toml: str) -> Scene:
-    """The scene of a TOML text, as `dumps` writes it. Raises SceneError."""
+    """The scene of a TOML text, as `dumps` writes it.
+
+    Raises:
+        SceneError: the scene can't be simulated.
+    """
     return _built(*scene_file.flattened(scene_file.parsed(toml), _SECTIONS))
 
 
 def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """A checked copy with other values by dotted key, ``{"motor.torque": 2.0}``; None makes one absent."""
+    """A checked copy with other values.
+
+    Args:
+        scene: the original, which stays as it is.
+        values: by dotted key, `{"motor.torque": 2.0}`; None makes a value absent.
+
+    Raises:
+        SceneError: the copy can't be simulated.
+    """
     parts = {"": scene, **{key: getattr(scene, key) for key in _SECTIONS}}
     parts |= {f"flagellum.{k}": own for k, own in enumerate(scene.flagellum)}
     flat = {f"{key}.{name}".lstrip("."): getattr(part, name) for key, part in parts.items() for name in part.settings}
@@ -248,26 +300,44 @@ def dumps(scene: Scene) -> str:
 
 
 def _built(values: Mapping[str, Any], tables: int) -> Scene:
-    """A scene from values by dotted key; ``tables`` overrides of flagella exist already."""
+    """A scene of values by dotted key, of which `tables` overrides of flagella exist already."""
+    problems = Problems()
     own: dict[int, dict[str, Any]] = {}
     sections: dict[str, dict[str, Any]] = {key: {} for key in ("", *_SECTIONS)}
     for key, value in values.items():
-        _check_known(key, value)
-        section, _, name = key.rpartition(".")
-        if section in sections:
-            sections[section][name] = value
-        else:
-            own.setdefault(int(section.partition(".")[2]), {})[name] = value
+        with problems.gathered():
+            _check_known(key, value, problems.full())
+            section, _, name = key.rpartition(".")
+            if section in sections:
+                sections[section][name] = value
+            else:
+                own.setdefault(int(section.partition(".")[2]), {})[name] = value
     if tables:
         sections["flagella"].setdefault("count", tables)
-    built: dict[str, Any] = {key: cls(**sections[key]) for key, cls in _SECTIONS.items()}
-    count = tables or (built["flagella"].count if own else 0)
+    built: dict[str, Any] = {}
+    for key, cls in _SECTIONS.items():
+        with problems.gathered():
+            built[key] = cls(**sections[key])
+    count = tables
+    if own and not tables:
+        count = built["flagella"].count if "flagella" in built else max(own) + 1
     for k in own:
         if k >= count:
             name, value = next(iter(own[k].items()))
-            raise SceneError(f"flagellum.{k}.{name}", value, f"there are flagella 0 to {count - 1}")
-    built["flagellum"] = tuple(_override(k, own.get(k, {})) for k in range(count))
-    return Scene(**sections[""], **built)
+            with problems.gathered():
+                raise SceneError(f"flagellum.{k}.{name}", value, f"there are flagella 0 to {count - 1}")
+    overrides = []
+    for k in range(count) if not problems.full() else ():
+        with problems.gathered():
+            overrides.append(_override(k, own.get(k, {})))
+    for name, setting in Scene.settings.items():
+        with problems.gathered():
+            if name in sections[""]:
+                setting.checked(name, sections[""][name])
+            elif name == "name":
+                raise SceneError(name, None, f"must be {setting.allowed}")
+    problems.raise_any()
+    return Scene(**sections[""], **built, flagellum=tuple(overrides))
 
 
 def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
@@ -275,19 +345,25 @@ def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
         return FlagellumOverride(**values)
     except SceneError as error:
         # The class doesn't know which of the tables it is.
-        leaf = str(error.key).rpartition(".")[2]
-        raise SceneError(f"flagellum.{k}.{leaf}", error.value, error.problem) from None
+        told = [
+            SceneError(f"flagellum.{k}.{str(e.key).rpartition('.')[2]}", e.value, e.problem)
+            for e in (error, *error.others)
+        ]
+        raise SceneError.joined(told) from None
 
 
-def _check_known(key: str, value: Any) -> None:
+def _check_known(key: str, value: Any, brief: bool) -> None:
+    """Raises SceneError for a key that no scene has; `brief`: without looking for one that it resembles."""
     if key in _SECTIONS:
         raise SceneError(key, value, f"is a section: [{key}] with {', '.join(_SECTIONS[key].settings)}")
     if key == "flagellum":
         raise SceneError(key, value, "must be tables [[flagellum]], one per flagellum")
-    indexed = re.fullmatch(r"flagellum\.(\d{1,9})\.(.+)", key)
+    indexed = re.fullmatch(r"flagellum\.(0|[1-9]\d{0,8})\.(.+)", key)
     plain = f"flagellum.{indexed[2]}" if indexed else key
     if plain in _KEYS and (indexed or not key.startswith("flagellum.")):
         return
+    if brief:
+        raise SceneError(key, value, "unknown key")
     near = scene_file.nearest(plain, _KEYS if "." in plain else [*_SECTIONS, *_KEYS])
     if near and near.startswith("flagellum."):
         near = near.replace("flagellum.", f"flagellum.{indexed[1] if indexed else 'K'}.")

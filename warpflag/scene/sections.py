@@ -40,7 +40,7 @@ class Flagella(Section, key="flagella"):
         derived="all flagella start at the same phase angle",
     )
     anchor_offset: float = number(
-        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", smallest=1e-4
+        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", usual=(1e-3, 5.0)
     )
     bending_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "A, the paper's")
     twist_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "C, in the paper equal to A")
@@ -66,7 +66,7 @@ class FlagellumOverride(Section, key="flagellum"):
 
     azimuth: float | None = number(None, "deg", -360, 360, "of the anchor about e_b3, from e_b1", derived="360 k/count")
     anchor_offset: float | None = number(
-        None, "um", -50, 50, "as flagella.anchor_offset", smallest=1e-4, derived="flagella.anchor_offset"
+        None, "um", -50, 50, "as flagella.anchor_offset", usual=(1e-3, 5.0), derived="flagella.anchor_offset"
     )
     motor_axis_angle: float | None = number(
         None, "deg", 0, 180, "motor axis to e_b3, toward the outward normal", derived="motor.axis_angle"
@@ -74,7 +74,7 @@ class FlagellumOverride(Section, key="flagellum"):
     tilt: float | None = number(
         None, "deg", 0, 180, "helix axis to e_b3, toward the normal", derived="flagella.opening_angle / 2"
     )
-    torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", smallest=1e-6, derived="motor.torque")
+    torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", usual=(1e-3, 1e3), derived="motor.torque")
     length: float | None = number(None, "um", 0.1, 100, "contour length", derived="flagella.length")
     segments: int | None = integer(
         None, 2, 10_000, "number of segments", derived="length / flagella.segment_length, rounded"
@@ -98,7 +98,7 @@ class Motor(Section, key="motor"):
     """
 
     torque: float = number(
-        3.4, "pN um", -1e3, 1e3, "on each flagellum about the motor axis; negative: reversed", smallest=1e-6
+        3.4, "pN um", -1e3, 1e3, "on each flagellum about the motor axis; negative: reversed", usual=(1e-3, 1e3)
     )
     axis_angle: float = number(55.0, "deg", 0, 180, "motor axis to e_b3, toward the outward normal")
     bearing_torque: bool = switch(
