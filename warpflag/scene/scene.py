@@ -327,7 +327,7 @@ def _built(values: Mapping[str, Any], tables: int) -> Scene:
             with problems.gathered():
                 raise SceneError(f"flagellum.{k}.{name}", value, f"there are flagella 0 to {count - 1}")
     overrides = []
-    for k in range(count) if not problems.full() else ():
+    for k in range(min(count, int(Flagella.settings["count"].high)) if not problems.full() else 0):
         with problems.gathered():
             overrides.append(_override(k, own.get(k, {})))
     for name, setting in Scene.settings.items():
