@@ -203,7 +203,7 @@ def test_no_segment_joins_one_flagellum_to_the_next():
     assert not observables.bundled_nodes(*joined(first, second, third)).any()
 
 
-def test_bundled_nodes_agree_with_a_plain_search_in_any_block_size(monkeypatch):
+def test_bundled_nodes_agree_with_a_plain_search_in_any_block_size():
     rng = np.random.default_rng(3)
     flagella = [np.cumsum(rng.normal(scale=0.12, size=(n, 3)), axis=0) for n in (9, 30, 17)]
     positions, first_node = joined(*flagella)
@@ -216,8 +216,7 @@ def test_bundled_nodes_agree_with_a_plain_search_in_any_block_size(monkeypatch):
             expected.append(nearest <= 0.44)
     assert 0 < sum(expected) < len(expected)
     for block in (1, 40, 1 << 20):
-        monkeypatch.setattr(observables.bundle, "_PAIRS_PER_BLOCK", block)
-        np.testing.assert_array_equal(observables.bundled_nodes(positions, first_node), expected)
+        np.testing.assert_array_equal(observables.bundled_nodes(positions, first_node, pairs_at_once=block), expected)
 
 
 # Rates

@@ -1,4 +1,4 @@
-"""Where the work of the motors goes."""
+"""The power balance of a cell: the work of the motors, what the fluid dissipates, and what is stored."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PowerBalance:
 
     @property
     def stored(self) -> float:
-        """What is left of the motors' work: the rate at which elastic and steric energy grow."""
+        """What is left of the motors' work [pN um/s]: the rate at which elastic and steric energy grow."""
         return self.motor - self.translation - self.spin - self.body
 
 
@@ -43,8 +43,11 @@ def power_balance(
 ) -> PowerBalance:
     """The powers of one cell. Inertia is absent, so what the fluid takes is the work of all forces on all velocities.
 
-    found: `Simulation.evaluate()`. torques: T_m [pN um], shape [flagellum_count]. motor_axes: m in the lab, shape
-    [flagellum_count, 3].
+    Args:
+        found: forces and velocities, from `Simulation.evaluate()`.
+        torques: T_m of the motors [pN um], shape [flagellum_count].
+        motor_axes: unit vectors m in the lab, shape [flagellum_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
     """
     first = np.array([rows.start for rows in flagella(first_node)])
     work = np.vecdot(found.forces, found.velocities)
