@@ -102,7 +102,7 @@ class Recorder:
             filament_radius: of the flagella [um].
             body_length: over the round ends [um].
             body_width: of the body [um].
-            versions: of the program and what it stands on, by name.
+            versions: of the program and the packages that it uses, by name.
 
         Raises:
             RecordError: a new file exists already; a resumed one is missing, damaged, has other flagella, or is being

@@ -1,4 +1,4 @@
-"""The sections of a scene: one frozen dataclass each, one declaration per setting.
+"""The sections of a scene: a frozen dataclass for each, with a declaration for every setting.
 
 Units are um, pN and s throughout (so pN um for torques, pN s/um^2 for viscosity); angles are in degrees.
 Defaults are those of Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015), "the paper", wherever it prints a
@@ -62,7 +62,7 @@ class Flagella(Section, key="flagella"):
 
 @dataclass(frozen=True)
 class FlagellumOverride(Section, key="flagellum"):
-    """What one flagellum has of its own: a [[flagellum]] table. Absent fields are the group's."""
+    """Values of a single flagellum, a [[flagellum]] table; what is absent is taken from the group."""
 
     azimuth: float | None = number(None, "deg", -360, 360, "of the anchor about e_b3, from e_b1", derived="360 k/count")
     anchor_offset: float | None = number(
@@ -126,7 +126,7 @@ class Fluid(Section, key="fluid"):
 
 @dataclass(frozen=True)
 class Hydrodynamics(Section, key="hydrodynamics"):
-    """Which flows of one node are felt by another.
+    """Which nodes move in the flow of which other nodes.
 
     none: local drag only. within: nodes of the same flagellum. between: nodes of different flagella.
     all: both, the paper's sum, with a radius that keeps it positive definite. as_printed: the paper's sum
@@ -161,9 +161,9 @@ class Steric(Section, key="steric"):
 
 @dataclass(frozen=True)
 class Body(Section, key="body"):
-    """The cell body: a spherocylinder to the flagella, a prolate spheroid to the fluid. Sizes: the paper.
+    """The cell body: a spherocylinder in contact, a prolate spheroid in the fluid. Sizes are the paper's.
 
-    The three motions are the paper's ablations; anchored takes all of them.
+    Switching its motions off one by one gives the paper's ablations; anchored switches all of them off.
     """
 
     length: float = number(2.5, "um", 0.1, 100, "L_b, caps included")
@@ -176,7 +176,7 @@ class Body(Section, key="body"):
 
 @dataclass(frozen=True)
 class Numerics(Section, key="numerics"):
-    """How time is stepped. Nothing here is physics."""
+    """How time is stepped: numerical method, step and precision."""
 
     stepper: str = choice(
         "implicit",
@@ -211,8 +211,7 @@ class Numerics(Section, key="numerics"):
 class Start(Section, key="start"):
     """Where the run starts: from the scene's own shape, or from a frame of a record.
 
-    A record brings the flagella's shape, their phases and the body's pose; phases that the scene gives are
-    then unused.
+    A record gives the shape of the flagella, their phases and the body's pose; phases of the scene are then unused.
     """
 
     record: str | None = text(
