@@ -1,4 +1,4 @@
-"""Rotations against SciPy-free definitions: Rodrigues' formula, products of quaternions, and the identity."""
+"""Rotations against Rodrigues' formula and the product of quaternions."""
 
 from __future__ import annotations
 
@@ -44,6 +44,14 @@ def test_vectors_are_found_again(vector):
 def test_more_than_half_a_turn_is_taken_the_other_way_round():
     found = rotations.vector_of_quaternion(helpers.quaternion([0.0, 0.0, 1.5 * np.pi]))
     np.testing.assert_allclose(found, [0.0, 0.0, -0.5 * np.pi], atol=1e-14)
+
+
+def test_product_turns_by_the_second_and_then_by_the_first():
+    first, second = helpers.quaternion(VECTORS[0]), helpers.quaternion(VECTORS[4])
+    found = rotations.product(2.0 * first, second)
+    assert np.linalg.norm(found) == pytest.approx(2.0)
+    expected = helpers.rotation(VECTORS[0]) @ helpers.rotation(VECTORS[4])
+    np.testing.assert_allclose(rotations.matrix(found), expected, atol=1e-14)
 
 
 def test_relative_rotation_is_in_the_axes_of_the_first():

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from warpflag.base.progress import Progress
-from warpflag.base.streams import is_terminal, say
+from warpflag.base.streams import is_terminal, protected_streams, say
 
 
 def closed() -> io.TextIOWrapper:
@@ -79,3 +79,47 @@ def test_a_process_with_a_broken_standard_error_reaches_its_end(tmp_path, redire
     command = f"'{sys.executable}' '{script}' {redirection}"
     subprocess.run(["bash", "-c", command], cwd=Path(__file__).parents[2], check=False, timeout=120)
     assert end.read_text() == "reached the end"
+
+
+COMMAND = """
+import os, sys
+from warpflag.base.streams import protected_streams
+
+@protected_streams()
+def command():
+    with open({path!r}, "w") as end:
+        assert end.fileno() > 2, "takes the place of a standard stream"
+        for _ in range(20):
+            print("µ" * 10_000)
+            print("µ" * 10_000, file=sys.stderr, flush=True)
+        os.write(2, b"as a library of another language does")
+        end.write("reached the end")
+    return 5
+
+sys.exit(command())
+"""
+
+
+@pytest.mark.parametrize(
+    "redirection",
+    [
+        *(">&-", "2>&-", "<&- >&- 2>&-", ">/dev/full", ">/dev/full 2>/dev/full"),
+        *("2>&1 | head -c 3", "| true", ">/dev/null 2>/dev/null"),
+    ],
+)
+def test_a_command_prints_to_broken_streams_and_keeps_its_status(tmp_path, redirection):
+    script, end = tmp_path / "script.py", tmp_path / "end"
+    script.write_text(COMMAND.format(path=str(end)))
+    shell = f"PYTHONIOENCODING=ascii '{sys.executable}' '{script}' {redirection}; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["bash", "-c", shell], cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, end.read_text()) == (5, "reached the end")
+    assert "Traceback" not in done.stderr and "Exception ignored" not in done.stderr
+
+
+def test_what_is_printed_to_sound_streams_arrives(capsys):
+    with protected_streams():
+        print("out")
+        print("error", file=sys.stderr)
+    assert capsys.readouterr() == ("out\n", "error\n")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["axis_of_body", "matrix", "relative", "rotated", "vector_of_matrix", "vector_of_quaternion"]
+__all__ = ["axis_of_body", "matrix", "product", "relative", "rotated", "vector_of_matrix", "vector_of_quaternion"]
 
 Array = NDArray[np.floating]
 
@@ -61,6 +61,23 @@ def rotated(quaternions: ArrayLike, vectors: ArrayLike) -> Array:
     return np.asarray(vectors, float) @ np.swapaxes(matrix(quaternions), -1, -2)
 
 
+def product(first: ArrayLike, second: ArrayLike) -> Array:
+    """Products of quaternions (x, y, z, w): the rotation by `second` and then by `first`.
+
+    Args:
+        first: shape [..., 4].
+        second: same shape.
+
+    Returns:
+        quaternions, same shape, whose lengths are the products of the lengths.
+    """
+    a, b = np.asarray(first, float), np.asarray(second, float)
+    va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = wa * vb + wb * va + np.cross(va, vb)
+    scalar = wa * wb - np.sum(va * vb, axis=-1, keepdims=True)
+    return np.concatenate([vector, scalar], axis=-1)
+
+
 def relative(first: ArrayLike, second: ArrayLike) -> Array:
     """The rotation from one orientation to another in the axes of the first: conjugate(first) second.
 
@@ -71,11 +88,7 @@ def relative(first: ArrayLike, second: ArrayLike) -> Array:
     Returns:
         unit quaternions, same shape.
     """
-    a, b = _unit(first), _unit(second)
-    va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = wa * vb - wb * va - np.cross(va, vb)
-    scalar = wa * wb + np.sum(va * vb, axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
+    return product(_unit(first) * [-1.0, -1.0, -1.0, 1.0], _unit(second))
 
 
 def vector_of_quaternion(quaternions: ArrayLike) -> Array:
