@@ -112,6 +112,7 @@ class Record:
         self.path = Path(path)
         if self.path.is_dir():
             self.path = self.path / RECORD_NAME
+        self._arrays: dict[str, FrameArray] = {}
         if not self.path.is_file():
             raise RecordError(f"{self.path}: no such record")
 
@@ -123,6 +124,7 @@ class Record:
 
     def close(self) -> None:
         """Closes the file, if it was opened."""
+        self._arrays.clear()
         if "_file" in self.__dict__:
             with _reading(self.path, "can't be closed"):
                 self.__dict__.pop("_file").close()
@@ -195,9 +197,12 @@ class Record:
             return dict(zip(summed_entries(sums), sums[: self.frame_count].T, strict=True))
 
     def _frames(self, name: str) -> FrameArray:
-        count, sums = self.frame_count, self._sums.get(name)
-        with _reading(self.path, "frames can't be read"):
-            return FrameArray(self._file[dataset_path(name)], sums, count, self.path, name)
+        """The frames of one entry; kept, because HDF5 forgets the chunks of a dataset that is opened anew."""
+        if name not in self._arrays:
+            count, sums = self.frame_count, self._sums.get(name)
+            with _reading(self.path, "frames can't be read"):
+                self._arrays[name] = FrameArray(self._file[dataset_path(name)], sums, count, self.path, name)
+        return self._arrays[name]
 
     @property
     def times(self) -> NDArray[np.float64]:
