@@ -7,12 +7,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import h5py  # noqa: TID253 (no command line starts here)
 import pytest
 
 from tests.record.test_record import FIRST_NODE, assert_holds_frames, frame, started, written
 from warpflag.base.output import DiskError
 from warpflag.record import Record, RecordError
+from warpflag.record.new_record import FORMAT, growth
 from warpflag.record.recorder import Recorder
 
 resource = pytest.importorskip("resource")
@@ -124,3 +127,24 @@ def test_a_record_has_one_writer(tmp_path, monkeypatch):
         started(path, resume_step=10**9)
     first.close()
     started(path, resume_step=10**9).close()
+
+
+@pytest.mark.parametrize("block", [1, 10, 64, 700])
+def test_the_space_reserved_is_enough_for_what_hdf5_takes_and_little_more(tmp_path, block):
+    """Up to more chunks than a node of HDF5's tree holds, so that nodes are split."""
+    path = written(tmp_path / "run.h5", 1)
+    with h5py.File(path, "r+", libver=FORMAT) as file:
+        datasets: list[Any] = []
+        file.visititems(lambda _, item: datasets.append(item) if getattr(item, "chunks", None) else None)
+        assert len(datasets) > 8
+        count, reserved, start = 1, 0, file.id.get_filesize()
+        for _ in range(min(90, 9000 // block)):
+            present, expected = file.id.get_filesize(), growth(datasets, count, count + block)
+            count += block
+            for dataset in datasets:
+                dataset.resize(count, axis=0)
+                dataset[count - block :] = 1
+            file.flush()
+            assert file.id.get_filesize() <= present + expected
+            reserved += expected - 4096
+        assert reserved < 1.5 * (file.id.get_filesize() - start) + 1e6

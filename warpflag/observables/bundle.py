@@ -41,21 +41,21 @@ def bundled_nodes(
     Source:
         the paper's bundled portion, "within a distance 2R".
     """
-    positions = np.asarray(positions, float)
-    positions = positions - positions.mean(axis=0)  # keeps the squares below small far from the origin
+    nodes: Array = np.asarray(positions, float)
+    nodes = nodes - nodes.mean(axis=0)  # keeps the squares below small far from the origin
     bounds = [int(i) for i in np.asarray(first_node)]
-    bundled = np.zeros(len(positions), dtype=bool)
-    edges = np.diff(positions, axis=0)
+    bundled = np.zeros(len(nodes), dtype=bool)
+    edges = np.diff(nodes, axis=0)
     is_segment = np.ones(len(edges), dtype=bool)
     is_segment[np.asarray(bounds[1:-1], dtype=int) - 1] = False  # tip of one, r_0 of the next
     for first, end in pairwise(bounds):
         others = is_segment.copy()
         others[first : end - 1] = False
-        starts, vectors = positions[:-1][others], edges[others]
+        starts, vectors = nodes[:-1][others], edges[others]
         rows = max(1, pairs_at_once // max(1, len(starts)))
         for row in range(first, end, rows):
             stop = min(row + rows, end)
-            bundled[row:stop] = _near_segments(positions[row:stop], starts, vectors, distance)
+            bundled[row:stop] = _near_segments(nodes[row:stop], starts, vectors, distance)
     return bundled
 
 

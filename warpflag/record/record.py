@@ -7,8 +7,6 @@ checksums as they are read. Records of versions that wrote no checksums are read
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpflag.record.frame_array import FrameArray, reading
 from warpflag.record.layout import (
     BODY_ORIENTATION,
     BODY_POSITION,
@@ -29,70 +28,13 @@ from warpflag.record.layout import (
     RECORD_NAME,
     Frame,
     RecordError,
-    checksum,
     dataset_path,
-    one_line,
     parameters_checksum,
     summed_entries,
     text_of,
 )
 
-__all__ = ["FrameArray", "Record"]
-
-
-@contextmanager
-def _reading(path: Path, what: str) -> Iterator[None]:
-    """Turns whatever HDF5 and h5py raise over a damaged file, which are errors of many kinds, into a RecordError."""
-    try:
-        yield
-    except RecordError:
-        raise
-    except Exception as error:
-        raise RecordError(f"{path}: {what}: {one_line(error)}") from error
-
-
-class FrameArray:
-    """Frames of one quantity, read as they are indexed: a[i], a[10:20, :3], or np.asarray(a) for all.
-
-    Attributes:
-        shape: [frame_count, ...], the committed frames only.
-    """
-
-    def __init__(self, dataset: Any, sums: NDArray[np.uint32] | None, frame_count: int, path: Path, name: str):
-        self._dataset = dataset
-        self._sums = sums
-        self._path = path
-        self._name = name
-        self.shape: tuple[int, ...] = (frame_count, *dataset.shape[1:])
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, key: Any) -> NDArray[np.float64]:
-        first, *rest = key if isinstance(key, tuple) else (key,)
-        if first is Ellipsis:
-            first, rest = slice(None), [Ellipsis, *rest]
-        rows = np.arange(len(self))[first]  # IndexError and negative steps as in any array
-        if rows.size == 0:
-            return np.empty(self.shape)[key]
-        low = int(rows.min())
-        with _reading(self._path, "frames can't be read"):
-            block = np.asarray(self._dataset[low : int(rows.max()) + 1])
-            if len(block) != int(rows.max()) + 1 - low:
-                raise RecordError(f"{self._path}: is damaged: /{self._name} ends before frame {int(rows.max())}")
-        self._verify(block, low)
-        return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.asarray(self[:], dtype=dtype)
-
-    def _verify(self, block: NDArray[Any], low: int) -> None:
-        if self._sums is None:
-            return
-        for index, (row, expected) in enumerate(zip(block, self._sums[low:], strict=False), low):
-            if checksum(row) != expected:
-                problem = f"frame {index} of /{self._name} does not agree with its checksum"
-                raise RecordError(f"{self._path}: is damaged: {problem}")
+__all__ = ["Record"]
 
 
 class Record:
@@ -126,14 +68,14 @@ class Record:
         """Closes the file, if it was opened."""
         self._arrays.clear()
         if "_file" in self.__dict__:
-            with _reading(self.path, "can't be closed"):
+            with reading(self.path, "can't be closed"):
                 self.__dict__.pop("_file").close()
 
     @cached_property
     def _file(self) -> Any:
         import h5py
 
-        with _reading(self.path, "not a readable HDF5 file"):
+        with reading(self.path, "not a readable HDF5 file"):
             try:
                 # Without a lock, or a run that is still writing would keep its readers out.
                 file = h5py.File(self.path, "r", locking=False)
@@ -142,7 +84,7 @@ class Record:
                 if "locking" not in str(error):
                     raise
                 file = h5py.File(self.path, "r")
-        with _reading(self.path, "is damaged"):
+        with reading(self.path, "is damaged"):
             missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
             if missing:
                 file.close()
@@ -155,7 +97,7 @@ class Record:
 
         Their shapes are compared with each other and with the flagella when they are first looked at.
         """
-        with _reading(self.path, "is damaged"):
+        with reading(self.path, "is damaged"):
             observables = [f"observables/{name}" for name in self._file.get("observables", ())]
             names = ["step", "time", *ENTRIES, *observables]
             nodes, flagella = int(self.first_node[-1]), len(self.first_node) - 1
@@ -184,7 +126,7 @@ class Record:
     @cached_property
     def frame_count(self) -> int:
         """Number of committed frames when the record was first looked at."""
-        with _reading(self.path, "is damaged"):
+        with reading(self.path, "is damaged"):
             return len(self._file[dataset_path(self.entries[0])])
 
     @cached_property
@@ -192,7 +134,7 @@ class Record:
         """Checksums of the committed frames by entry, shape [frame_count]; empty for a record without."""
         if CHECKSUMS not in self.entries:
             return {}
-        with _reading(self.path, "checksums can't be read"):
+        with reading(self.path, "checksums can't be read"):
             sums = self._file[CHECKSUMS]
             return dict(zip(summed_entries(sums), sums[: self.frame_count].T, strict=True))
 
@@ -200,7 +142,7 @@ class Record:
         """The frames of one entry; kept, because HDF5 forgets the chunks of a dataset that is opened anew."""
         if name not in self._arrays:
             count, sums = self.frame_count, self._sums.get(name)
-            with _reading(self.path, "frames can't be read"):
+            with reading(self.path, "frames can't be read"):
                 self._arrays[name] = FrameArray(self._file[dataset_path(name)], sums, count, self.path, name)
         return self._arrays[name]
 
@@ -255,7 +197,7 @@ class Record:
 
         Lengths in um; first_node has the shape [flagellum_count + 1], versions maps names to versions.
         """
-        with _reading(self.path, "is damaged: /parameters can't be read"):
+        with reading(self.path, "is damaged: /parameters can't be read"):
             group = self._file["parameters"]
             if any(np.prod(group[name].shape, dtype=int) > self.path.stat().st_size for name in PARAMETERS):
                 raise RecordError(f"{self.path}: is damaged: /parameters is larger than the file")

@@ -23,12 +23,7 @@ from numpy.typing import ArrayLike
 from warpflag.base.output import DiskError
 from warpflag.record.disk import DiskFile
 from warpflag.record.layout import (
-    BODY_ORIENTATION,
-    BODY_POSITION,
     CHECKSUMS,
-    E1,
-    MOTOR_ANGLE,
-    POSITION,
     Frame,
     RecordError,
     checksum,
@@ -37,18 +32,13 @@ from warpflag.record.layout import (
     parameters_checksum,
     summed_entries,
 )
+from warpflag.record.new_record import FORMAT, add_parameters, first_image, growth, values_of
 from warpflag.record.record import Record
 
 __all__ = ["Recorder"]
 
 _BLOCK_FRAMES = 10
 _BLOCK_SECONDS = 2.0
-_CHUNK_BYTES = 1 << 20
-_SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
-_TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
-# The format of HDF5 1.8: groups and headers of datasets carry a checksum. Later formats mark a file as open while it
-# is written, and one whose writer was killed can't be opened again.
-_FORMAT = ("v108", "v108")
 
 
 class Recorder:
@@ -130,7 +120,7 @@ class Recorder:
             ValueError: its shapes or observables are not those of the record.
             DiskError: a block of frames could not be written; all committed before stay readable.
         """
-        values = _values(frame)
+        values = values_of(frame)
         if self._file is None:
             self._create(values)
             return
@@ -178,7 +168,7 @@ class Recorder:
         if CHECKSUMS in self._shapes:
             sums = [[checksum(values[name]) for name in self._summed] for values in self._pending]
             rows[CHECKSUMS] = np.array(sums, dtype=np.uint32)
-        self._disk.reserve(self._file.id.get_filesize() + self._growth(count))
+        self._disk.reserve(self._file.id.get_filesize() + growth(self._datasets.values(), self._committed, count))
         try:
             for group in ([name for name in self._shapes if name != "step"], ["step"]):
                 for name in group:
@@ -192,19 +182,6 @@ class Recorder:
         self._committed = count
         self._pending = []
         self._last_commit = self._clock()
-
-    def _growth(self, count: int) -> int:
-        """Bytes by which the file grows at most when it gets `count` frames."""
-        total = _SLACK_BYTES
-        for dataset in self._datasets.values():
-            chunk = dataset.chunks
-            before, after = (-(-frames // chunk[0]) for frames in (self._committed, count))
-            if after > before:
-                node = 24 + 8 * _TREE_FANOUT + (_TREE_FANOUT + 1) * 8 * (len(chunk) + 2)
-                # A full node is split, and so may be those above it.
-                nodes = 3 + (after - before) // 16 if after > _TREE_FANOUT else int(before == 0)
-                total += (after - before) * int(np.prod(chunk)) * dataset.dtype.itemsize + nodes * node
-        return total
 
     def _abandon(self) -> None:
         """Closes HDF5's file after a write that failed; what it still writes goes nowhere, and can't fail again."""
@@ -245,7 +222,7 @@ class Recorder:
             DiskError: it could not be written; there is none then.
         """
         self._refuse_existing()
-        image = self._image(values)
+        image = first_image(values, self._parameters)
         temporary = self.path.with_name(self.path.name + ".tmp")
         try:
             with open(temporary, "wb") as file:
@@ -259,43 +236,6 @@ class Recorder:
             raise DiskError.of(self.path, error) from error
         self._open(DiskFile(self.path), [*values, CHECKSUMS])
         self._committed, self._last_commit = 1, self._clock()
-
-    def _image(self, values: dict[str, Any]) -> bytes:
-        """The bytes of a record of one frame."""
-        import h5py
-
-        first_node = self._parameters["first_node"]
-        expected = {
-            POSITION: (int(first_node[-1]), 3),
-            E1: (int(first_node[-1]), 3),
-            MOTOR_ANGLE: (len(first_node) - 1,),
-        }
-        for name, shape in expected.items():
-            if np.shape(values[name]) != shape:
-                raise ValueError(f"{name} of a frame has shape {np.shape(values[name])}, the scene's is {shape}")
-        with h5py.File(
-            f"{self.path}.new", "w", driver="core", backing_store=False, block_size=4096, libver=_FORMAT
-        ) as file:
-            file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
-            file.create_group("h5md/author").attrs["name"] = _text("unknown")
-            creator = file.create_group("h5md/creator")
-            creator.attrs["name"] = _text("warpflag")
-            creator.attrs["version"] = _text(self._parameters["versions"].get("warpflag", "unknown"))
-            box = file.create_group("particles/flagella/box")
-            box.attrs["dimension"] = np.int32(3)
-            box.attrs["boundary"] = np.array([_text("none")] * 3)
-            # The shared datasets first, under the entry that every record has.
-            for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
-                _add_dataset(file, name, values[name])
-            for name in values.keys() - {"step", "time", POSITION}:
-                file[f"{name}/step"] = file[dataset_path("step")]
-                file[f"{name}/time"] = file[dataset_path("time")]
-            first = np.array([checksum(value) for value in values.values()], dtype=np.uint32)
-            sums = _add_dataset(file, CHECKSUMS, first)
-            sums.attrs["entries"] = np.array([_text(name) for name in values])
-            _add_parameters(file, self._parameters)
-            file.flush()
-            return file.id.get_file_image()
 
     def _reopen(self, resume_step: int) -> None:
         """Opens an existing file and cuts it to the frames with step <= resume_step."""
@@ -323,7 +263,7 @@ class Recorder:
         import h5py
 
         self._disk = disk
-        self._file = h5py.File(self.path, "r+", locking=False, libver=_FORMAT)
+        self._file = h5py.File(self.path, "r+", locking=False, libver=FORMAT)
         self._datasets = {name: self._file[dataset_path(name)] for name in names}
         self._shapes = {name: tuple(dataset.shape[1:]) for name, dataset in self._datasets.items()}
         if CHECKSUMS in self._datasets:
@@ -345,9 +285,9 @@ class Recorder:
             shutil.copyfile(self.path, temporary)
             changed = DiskFile(temporary)
             changed.reserve(os.path.getsize(temporary) + len(self._parameters["scene"]) + (1 << 16))
-            with h5py.File(temporary, "r+", locking=False, libver=_FORMAT) as file:
+            with h5py.File(temporary, "r+", locking=False, libver=FORMAT) as file:
                 del file["parameters"]
-                _add_parameters(file, self._parameters)
+                add_parameters(file, self._parameters)
             changed.sync()
             os.replace(temporary, self.path)
         except OSError as error:
@@ -359,40 +299,3 @@ class Recorder:
         finally:
             disk.close()
         return changed
-
-
-def _add_dataset(file: Any, name: str, value: Any) -> Any:
-    """A dataset of frames whose first is `value`, in chunks of 16 to 64 frames."""
-    first = np.asarray(value)[None]
-    chunk = int(np.clip(_CHUNK_BYTES // max(1, first.nbytes), 16, 64))
-    shape = first.shape[1:]
-    return file.create_dataset(dataset_path(name), data=first, maxshape=(None, *shape), chunks=(chunk, *shape))
-
-
-def _add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
-    group = file.create_group("parameters")
-    for name, value in parameters.items():
-        if name == "versions":
-            group.create_group(name).attrs.update({key: _text(version) for key, version in value.items()})
-        else:
-            group[name] = _text(value) if isinstance(value, str) else value
-    group.attrs["checksum"] = np.uint32(parameters_checksum(parameters))
-
-
-def _text(text: str) -> np.bytes_:
-    """A text of fixed length: HDF5 does not return from reading a damaged heap of texts of variable length."""
-    return np.bytes_(text.encode())
-
-
-def _values(frame: Frame) -> dict[str, Any]:
-    """A copy of a frame by the names of its entries in the file."""
-    values = {
-        POSITION: frame.positions,
-        E1: frame.directors,
-        MOTOR_ANGLE: frame.motor_angle,
-        BODY_POSITION: frame.body_position,
-        BODY_ORIENTATION: frame.body_orientation,
-        "time": frame.time,
-        **{f"observables/{name}": value for name, value in frame.observables.items()},
-    }
-    return {"step": np.int64(frame.step), **{name: np.array(v, dtype=np.float64) for name, v in values.items()}}

@@ -39,8 +39,8 @@ class Setting:
         unit: of its numbers.
         low: least value, inclusive.
         high: greatest value, inclusive.
-        usual: magnitudes that a number in this unit usually has; one far below them that has such a magnitude in the
-            SI unit is refused. For numbers whose range includes zero, where the bounds find no slip of units.
+        usual: magnitudes that a number in this unit usually has; a number that has such a magnitude if it is taken in
+            the SI unit is refused. For ranges that include zero, whose bounds find no number in the wrong unit.
         choices: what a choice may be.
         pattern: regular expression of a text.
         pattern_text: the same in words.
@@ -119,7 +119,7 @@ class Setting:
             raise SceneError(key, value, f"must be {self.allowed}")
         if not self.low <= item <= self.high:  # a NaN fails both comparisons
             raise SceneError(key, value, f"{self._other_unit(item)}must be {self.allowed}")
-        if self.usual is not None and abs(item) < self.usual[0]:
+        if self.usual is not None:
             plural, slips = UNIT_SLIPS[self.unit]
             si_unit, factor = slips[0]
             if self.usual[0] <= abs(item) * factor <= self.usual[1]:
