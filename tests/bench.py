@@ -6,15 +6,18 @@ with the body) and spin.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels.implicit import block_band, linearised
+from warpflag_kernels.base.plan import Plan
+from warpflag_kernels.implicit import linear_system, linearised
 from warpflag_kernels.rod import chain_chart, hessian
 
 from tests.helpers import anchors, cell, matrix, shaken
 from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius
+from tests.plans import plan
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
@@ -35,9 +38,9 @@ def close(found: Any, exact: Any, precision: str, factor: float = 1.0, tolerance
 class Bench:
     """A scene at rest in its start, its stepper's buffers, and the kernels on them. Vectors are (body, nodes)."""
 
-    def __init__(self, scene: Scene, start: InitialState | None, device: str) -> None:
+    def __init__(self, scene: Scene, start: InitialState | None, device: str, plan: Plan | None = None) -> None:
         scene = with_values(scene, {"numerics.stepper": "implicit"})
-        self.scene, self.sim = scene, Simulation(scene, device=device, starts=start)
+        self.scene, self.sim = scene, Simulation(scene, device=device, starts=start, plan=plan)
         self.sim.evaluate()
         s, self.stepper = self.sim.system, self.sim.stepper
         self.model, self.state, self.data = s.model, s.state, s.state.data
@@ -45,6 +48,7 @@ class Bench:
         self.first = anchors(scene)
         self.start = start
         self.data.active.fill_(1)
+        linearised.allocate(self.model, self.state)
 
     def increment(self, body: Any = 0.0, nodes: Any = 0.0) -> Any:
         p, device = self.model.precision, self.model.device
@@ -53,37 +57,30 @@ class Bench:
         x.body = wp.array(np.zeros((1, 6)) + body, dtype=chain_chart.types(p).vec6, device=device)
         return x
 
-    def retract(self, x: Any, scale: float = 1.0, carry: Any = None) -> Any:
-        """Moves the state to the pose that scale * x leads to from the start; returns what `carry` became."""
+    def retract(self, x: Any, scale: float = 1.0, other: Any = None) -> Any:
+        """Moves the state to the pose that scale * x leads to from the start; returns `other`, transported there."""
         out, unused = self.increment(), self.increment()
         scales = wp.full(1, scale, dtype=wp.float64, device=self.model.device)
-        carry = (carry or self.increment(), self.increment(), out, unused)
-        chain_chart.retract(self.model, self.state, self.stepper._base, scales, x, self.stepper._now, carry)
+        transported = (other or self.increment(), self.increment(), out, unused)
+        base, pose = self.sim.system.chart.base, self.data.pose
+        chain_chart.retract(self.model, self.state, base, scales, x, pose, transported)
         return out
 
     def factorise(self, step: float, weight: float) -> Any:
-        band, stiffness = self.stepper._band, self.stepper._stiffness
+        band, stiffness = self.stepper.band, self.stepper.stiffness
         band.step.fill_(step)
         band.weight.fill_(weight)
         band.singular.zero_()
         hessian.joint_stiffness(self.model, self.state, stiffness)
-        block_band.factorise(self.model, self.state, stiffness, band)
+        linear_system.factorise(self.model, self.state, stiffness, band)
         return band
 
     def force_change(self, body: Any, nodes: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """-H x: change of the body's force and torque, of the forces, and of the spin torques."""
-        x = self.increment(body, nodes)
-        k = linearised.kernels_of(self.model)
-        inputs, device = [self.model.data, self.stepper._stiffness, x, self.data], self.model.device
-        wp.launch(k.joint_changes, self.count, inputs=inputs, device=device)
-        wp.launch(k.gather_changes, self.count, inputs=inputs, device=device)
+        linearised.force_changes(self.model, self.state, self.stepper.stiffness, self.increment(body, nodes))
         forces, torques = self.data.force.numpy().astype(float), self.data.spin_torque.numpy().astype(float)
-        arms, m = self.data.position.numpy()[self.first], self.data.tangent.numpy()[self.first]
-        on_body = forces[self.first].sum(axis=0)
-        torque = np.cross(arms, forces[self.first]).sum(axis=0)
-        if self.model.switches.bearing_torque:
-            torque -= np.cross(m, self.data.joint_before.numpy()[self.first]).sum(axis=0)
-        return np.concatenate([on_body, torque]), forces, torques
+        on_body, torque = self.data.flagellum_force.numpy(), self.data.flagellum_torque.numpy()
+        return np.concatenate([on_body.sum(axis=0), torque.sum(axis=0)]).astype(float), forces, torques
 
     def hessian(self) -> np.ndarray:
         """Dense H, shape [6 + 4 count, 6 + 4 count]; rows and columns of the displacement of r_0 are zero."""
@@ -132,9 +129,18 @@ def flat(x: Any) -> np.ndarray:
     return np.concatenate([x.body.numpy().ravel(), x.node.numpy().ravel()]).astype(np.float64)
 
 
-def bench(values: dict[str, Any], precision: str, device: str, seed: int = 1, **shake: float) -> Bench:
+def bench(
+    values: dict[str, Any],
+    precision: str,
+    device: str,
+    seed: int = 1,
+    planned: Callable[[Plan], Plan] = lambda own: own,
+    **shake: float,
+) -> Bench:
+    """A disturbed cell; planned: of the plan that is chosen for it, the one that is to be used."""
     scene = cell({"flagella.length": 1.0, **values}, precision)
-    return Bench(scene, shaken(scene, seed, **{"node": 2e-3, "spin": 0.05, **shake}), device)
+    start = shaken(scene, seed, **{"node": 2e-3, "spin": 0.05, **shake})
+    return Bench(scene, start, device, planned(plan(scene, device)))
 
 
 def dense_system(b: Bench, step: float, weight: float) -> np.ndarray:

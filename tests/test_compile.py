@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels.base.types import DeviceModel
+from warpflag_kernels.base.plan import CONTACT_BLOCK
 
 from tests.helpers import cell
+from tests.plans import as_on_gpu, plan
 from warpflag.run.simulation import Simulation
 
 KERNELS = Path(warpflag_kernels.__file__).parent
@@ -27,11 +28,19 @@ SWITCHES = {
         "motor.bearing_torque": False,
     },
     "short": {"numerics.pair_precision": "float32"},
+    "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
-VARIANTS = [("rkc", "within"), ("rkc", "between"), ("rkc", "none"), ("rkc", "short"), ("implicit", "none")]
+VARIANTS = [
+    ("rkc", "within"),
+    ("rkc", "between"),
+    ("rkc", "none"),
+    ("rkc", "short"),
+    ("rkc", "external"),
+    ("implicit", "none"),
+]
 
 
 def kernels_in_source() -> set[tuple[str, str]]:
@@ -39,7 +48,7 @@ def kernels_in_source() -> set[tuple[str, str]]:
     found = set()
     for path in KERNELS.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(d) for d in node.decorator_list):
+            if isinstance(node, ast.FunctionDef) and any("wp.kernel" in ast.unparse(d) for d in node.decorator_list):
                 found.add((path.name, node.name))
     return found
 
@@ -55,10 +64,8 @@ def launched(
     controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
-        if not by_cells:
-            patch.setattr(DeviceModel, "one_thread_per_cell", False)
-            patch.setattr(DeviceModel, "threads_cooperate", True)
-        sim = Simulation(scene, device="cpu")
+        own = plan(scene, "cpu")
+        sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own, CONTACT_BLOCK))
         sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:
             sim.stepper.stability.due.fill_(1)

@@ -17,6 +17,7 @@ With cuobjdump on the PATH the numbers are checked against `cuobjdump -res-usage
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib
 import re
 import shutil
@@ -29,11 +30,13 @@ from typing import Any
 
 import warp as wp
 import warpflag_kernels
-from cells import spread
-from cubin import Usage, usage
-from harness import table
-from warpflag_kernels.base.types import DeviceModel
+from tools.cells import spread
+from tools.cubin import Usage, usage
+from tools.harness import table
+from warpflag_kernels.base.plan import CONTACT_BLOCK, Plan
 
+from warpflag.base.device import find_device
+from warpflag.model.build import plan_of
 from warpflag.run.simulation import Simulation
 from warpflag.scene import with_values
 
@@ -42,26 +45,29 @@ STEPPERS = ("rkc", "euler", "implicit")
 
 @contextmanager
 def collected() -> Iterator[set[Any]]:
-    """Kernels that are launched meanwhile as on CUDA, of which none is compiled or run."""
+    """Kernels that are launched meanwhile, of which none is compiled or run."""
     kernels: set[Any] = set()
     kept = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
-    by_cells, together = DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate
     try:
         for name in kept:
             setattr(wp, name, lambda kernel, *_arguments, **_options: kernels.add(kernel))
-        DeviceModel.one_thread_per_cell = False  # which is for a CPU
-        DeviceModel.threads_cooperate = True
         yield kernels
     finally:
         for name, function in kept.items():
             setattr(wp, name, function)
-        DeviceModel.one_thread_per_cell, DeviceModel.threads_cooperate = by_cells, together
+
+
+def as_on_gpu(own: Plan) -> Plan:
+    """The forms of a GPU, on the plan's own device."""
+    forms = {"launch": "elements", "pair_sum": "warp", "step_pairs": "gathered", "chains": "serial"}
+    return dataclasses.replace(own, contact_block=CONTACT_BLOCK, **forms)
 
 
 def launched(precision: str, stepper: str) -> set[Any]:
     """Kernels of a run with every term of the model."""
     values = {"numerics.stepper": stepper} | ({} if stepper == "euler" else {"numerics.accuracy": 1e-3})
-    sim = Simulation(with_values(spread(3, 10, precision), values), device="cpu")
+    scene = with_values(spread(3, 10, precision), values)
+    sim = Simulation(scene, plan=as_on_gpu(plan_of([scene], find_device("cpu"))))
     sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
     if stepper == "implicit":
         sim.stepper.stability.due.fill_(1)

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from cells import placed, shaken, shape, spread
-from harness import Contender, Repeated, interleaved, table
+from tools.cells import placed, shaken, shape, spread
+from tools.harness import Contender, Repeated, interleaved, table
 from warpflag_kernels.fluid import node_velocity
 
 from warpflag.model.geometry import InitialState

@@ -30,11 +30,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba_sum
 import numpy as np
-from cells import moving_nodes, placed, shaken, spread
-from harness import Contender, Repeated, interleaved, save_plot, table
-from native import NativePairSum, compiler
+from tools import numba_sum
+from tools.cells import moving_nodes, placed, shaken, spread
+from tools.harness import Contender, Repeated, interleaved, save_plot, table
+from tools.native import NativePairSum, compiler
 from warpflag_kernels.fluid import node_velocity
 
 from warpflag.scene import Scene

@@ -56,15 +56,13 @@ def balance(values: dict[str, Any], duration: float, interval: float) -> tuple[f
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
     scene = with_values(Scene(name="balance", flagellum=phases), {"duration": 1.0, **values})
     sim = Simulation(scene, device="cpu")
-    first = sim.first_node[:-1]
     torques = np.array([spec.torque for spec in scene.resolved_flagella()])
     dissipated, ends = [], []
     count = round((duration - BEGIN) / interval)
     for k in range(count + 1):
         sim.advance(BEGIN + k * interval)
         state = sim.cell_state()
-        powers = power_balance(sim.evaluate(), torques, state.tangents[first], sim.first_node)
-        dissipated.append(powers.translation + powers.spin + powers.body)
+        dissipated.append(power_balance(sim.evaluate()).dissipated)
         if k in (0, count):
             energy = float(state.elastic_energy.sum()) + steric_energy(scene, state, sim.first_node)
             ends.append((float(torques @ state.motor_angle), energy))

@@ -32,11 +32,11 @@ import time
 from typing import Any
 
 import numpy as np
-from cells import placed
-from harness import Repeated, interleaved, table
+from tools.cells import placed
+from tools.harness import Repeated, interleaved, table
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.model.geometry import initial_state
-from warpflag.model.terms import launch_right_hand_side
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
 

@@ -28,13 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import warp as wp
-from cells import moving_nodes, placed, shape, spread
-from harness import Contender, Repeated, interleaved, table
-from native import NativePairSum, compiler
+from tools.cells import moving_nodes, placed, shape, spread
+from tools.harness import Contender, Repeated, interleaved, table
+from tools.native import NativePairSum, compiler
 from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side, stages
 
 from warpflag.model.geometry import InitialState
-from warpflag.model.terms import launch_right_hand_side, right_hand_side
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, load, with_values
 from warpflag.scene.resistance import pair_radius
@@ -42,7 +42,7 @@ from warpflag.scene.resistance import pair_radius
 EXAMPLES = Path(__file__).parents[1]
 CONTACT_TIME = 5.5e-3  # s; the zipping scene has some ten closed contacts then
 STRETCH = 2e-4  # s, of a run; twenty default steps of RKC
-PLACING, RATES, LAUNCH = "placing (chart)", "rates (chart)", "a launch"
+RECONSTRUCTION, RATES, LAUNCH = "reconstruction (chart)", "rates (chart)", "a launch"
 WHOLE, PASS, CPP = "right-hand side", "pass", "C++ pair sum"
 
 
@@ -89,7 +89,7 @@ def contact_state(scene: Scene) -> InitialState:
 def native_pair_sum(sim: Simulation, scene: Scene) -> NativePairSum:
     """The C++ sum over the moving nodes of a placed simulation."""
     moving = moving_nodes(sim)
-    forces, positions = sim.system.state.data.force.numpy(), sim.system.state.data.position.numpy()
+    forces, positions = sim.system.state.data.force.numpy(), sim.system.state.data.pose.position.numpy()
     return NativePairSum(positions[moving], forces[moving], pair_radius(scene), scene.numerics.precision)
 
 
@@ -98,9 +98,11 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
     sim = placed(scene, start)
     model, state = sim.system.model, sim.system.state
     anything = wp.zeros(1, dtype=wp.int32, device="cpu")
-    launches: dict[str, Callable[[], Any]] = {PLACING: lambda: reconstruction.place(model, state, sim.system.chart)}
-    for stage in right_hand_side(model.switches):
-        launches[stage.name] = lambda stage=stage: stage.launch(model, state)
+    launches: dict[str, Callable[[], Any]] = {
+        RECONSTRUCTION: lambda: reconstruction.reconstruct(model, state, sim.system.chart)
+    }
+    for name, launch in stages(model):
+        launches[name] = lambda launch=launch: launch(model, state)
     launches[RATES] = lambda: comoving_chart.increment_rates(model, state, sim.system.chart)
     launches[WHOLE] = lambda: launch_right_hand_side(model, state)
     launches[LAUNCH] = lambda: wp.launch(_nothing, model.element_count, inputs=[anything], device="cpu")
@@ -113,14 +115,14 @@ def staged(scene: Scene, start: InitialState | None, rounds: int) -> dict[str, f
 
 def stage_table(at_start: dict[str, float], in_contact: dict[str, float]) -> str:
     """Parts of a pass and their shares of it, the stages of the right-hand side by themselves, and C++."""
-    parts = (PLACING, WHOLE, RATES)
-    stages = [name for name in at_start if name not in (*parts, PASS, CPP, LAUNCH)]
+    parts = (RECONSTRUCTION, WHOLE, RATES)
+    own = [name for name in at_start if name not in (*parts, PASS, CPP, LAUNCH)]
     rows = []
-    for name in [*parts, "stepper", PASS, *stages, "saved", LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
+    for name in [*parts, "stepper", PASS, *own, "saved", LAUNCH, CPP, "right-hand side / C++", "pass / C++"]:
         row: list[Any] = [name]
         for times in (at_start, in_contact):
             rest = times[PASS] - sum(times[part] for part in parts)
-            saved = sum(times[stage] for stage in stages) - times[WHOLE]
+            saved = sum(times[stage] for stage in own) - times[WHOLE]
             values = {**times, "stepper": rest, "saved": saved}
             if name.endswith("/ C++"):
                 row += [times[name.removesuffix(" / C++")] / times[CPP] if CPP in times else None, None]
@@ -138,8 +140,9 @@ def whole_row(name: str, scene: Scene, start: InitialState | None, rounds: int) 
     model, state = sim.system.model, sim.system.state
     large = model.element_count > 1000
     launches: dict[str, Callable[[], Any]] = {WHOLE: lambda: launch_right_hand_side(model, state)}
-    steric, pairs = (next(s for s in right_hand_side(model.switches) if word in s.name) for word in ("steric", "pair"))
-    launches |= {stage.name: lambda stage=stage: stage.launch(model, state) for stage in (steric, pairs)}
+    for word in ("steric", "pair"):
+        stage, launch = next((name, launch) for name, launch in stages(model) if word in name)
+        launches[stage] = lambda launch=launch: launch(model, state)
     contenders: dict[str, Contender] = {key: Repeated(do, unroll=1 if large else 8) for key, do in launches.items()}
     if compiler():
         contenders[CPP] = native_pair_sum(sim, scene)

@@ -17,10 +17,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from cells import moving_nodes, placed, spread
-from harness import Contender, Repeated, interleaved, save_plot, table
-
-from warpflag.model.terms import launch_right_hand_side, right_hand_side
+from tools.cells import moving_nodes, placed, spread
+from tools.harness import Contender, Repeated, interleaved, save_plot, table
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side, stages
 
 SEGMENTS = 30
 NODES = [60, 120, 300, 600, 1200, 2400, 5100, 10200, 20010]
@@ -32,11 +31,11 @@ def measured(nodes: int, precision: str, rounds: int) -> tuple[int, dict[str, fl
     """Moving nodes, and the times of the right-hand side, of its pair sum and of its contact search [s]."""
     sim = placed(spread(max(2, round(nodes / SEGMENTS)), SEGMENTS, precision))
     model, state = sim.system.model, sim.system.state
-    stages = {"pair sum": "pair", "contact search": "steric"}
+    parts = {"pair sum": "pair", "contact search": "steric"}
     launches = {WHOLE: lambda: launch_right_hand_side(model, state)}
-    for name, word in stages.items():
-        stage = next(stage for stage in right_hand_side(model.switches) if word in stage.name)
-        launches[name] = lambda stage=stage: stage.launch(model, state)
+    for name, word in parts.items():
+        launch = next(launch for stage, launch in stages(model) if word in stage)
+        launches[name] = lambda launch=launch: launch(model, state)
     unroll = 8 if model.element_count < 1000 else 1
     contenders: dict[str, Contender] = {name: Repeated(launch, unroll=unroll) for name, launch in launches.items()}
     quick = interleaved({WHOLE: contenders[WHOLE]}, rounds=1)[WHOLE]

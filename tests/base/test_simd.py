@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 from warpflag_kernels.base import simd
-from warpflag_kernels.base.types import DeviceModel, Precision
-from warpflag_kernels.implicit import block_band
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.implicit import linear_system
 from warpflag_kernels.rod import chain_chart
 
 from tests.bench import Bench, bench, close
+from tests.plans import by_elements
 
 UNEQUAL = {"flagellum.1.length": 1.2, "flagellum.1.segments": 5, "flagellum.2.length": 0.8}
 # Of ten flagella in float64: a register of eight lanes, and one of two.
@@ -28,31 +30,33 @@ def crowd(request: pytest.FixtureRequest, device: str, precision: str) -> Bench:
     return bench(CELLS[request.param], precision, device)
 
 
-def in_both_forms(monkeypatch: pytest.MonkeyPatch, b: Bench, results: Any) -> None:
-    """What `results` gives is the same to round-off."""
-    found = []
-    for form in (False, True):
-        monkeypatch.setattr(DeviceModel, "one_thread_per_cell", property(lambda m, form=form: form and m.device.is_cpu))
+def in_both_forms(b: Bench, results: Any) -> None:
+    """What `results` gives is the same to round-off, flagella side by side and one by one."""
+    if b.model.plan.chains != "simd":
+        pytest.skip("vector lanes are a CPU's")
+    found, side_by_side = [], b.model
+    for model in (dataclasses.replace(side_by_side, plan=by_elements(side_by_side.plan)), side_by_side):
+        b.model = model
         found.append([a.numpy().copy() for a in results()])
     for one_by_one, together in zip(*found, strict=True):
         assert np.abs(one_by_one).max() > 0
         assert close(together, one_by_one, b.model.precision.name, tolerance=ROUND_OFF)
 
 
-def test_solutions_are_the_same(crowd, monkeypatch):
+def test_solutions_are_the_same(crowd):
     right = np.random.default_rng(5).uniform(-1, 1, (crowd.count, 4))
 
     def results():
         band, y = crowd.factorise(1e-5, 0.9), crowd.increment(1.0, right)
-        block_band.solve(crowd.model, crowd.state, band, y)
+        linear_system.solve(crowd.model, crowd.state, band, y)
         return band.body_columns, band.body_block, band.body_inverse, y.body, y.node
 
-    in_both_forms(monkeypatch, crowd, results)
+    in_both_forms(crowd, results)
 
 
 @pytest.mark.parametrize("angle", [0.1, 1.5])
 @pytest.mark.parametrize("in_place", [False, True])
-def test_retractions_are_the_same(angle, in_place, crowd, monkeypatch):
+def test_retractions_are_the_same(angle, in_place, crowd):
     """Turns for which the series of sine and cosine hold, and others."""
     b, own, random = crowd, crowd.stepper, np.random.default_rng(6)
     nodes = random.uniform(-1, 1, (b.count, 4)) * [0.05, 0.05, 0.05, angle]
@@ -61,18 +65,19 @@ def test_retractions_are_the_same(angle, in_place, crowd, monkeypatch):
     def results():
         a_out, b_out = b.increment(), b.increment()
         b.retract(b.increment())
-        start = own._now if in_place else own._base
-        chain_chart.retract(b.model, b.state, start, own.data.one, x, own._now, (carried, x, a_out, b_out))
-        d = b.data
+        d = b.data.pose
+        start = d if in_place else b.sim.system.chart.base
+        chain_chart.retract(b.model, b.state, start, own.data.one, x, d, (carried, x, a_out, b_out))
         return (d.position, d.tangent, d.director, d.length, a_out.node, a_out.body, b_out.node, b_out.body)
 
-    in_both_forms(monkeypatch, crowd, results)
+    in_both_forms(crowd, results)
 
 
 @pytest.mark.parametrize("step", [-1e-9, np.nan])
-@pytest.mark.parametrize("form", [False, True])
-def test_a_pivot_that_is_not_positive_is_told(form, step, crowd, monkeypatch):
-    monkeypatch.setattr(DeviceModel, "one_thread_per_cell", property(lambda m: form and m.device.is_cpu))
+@pytest.mark.parametrize("one_by_one", [False, True])
+def test_a_pivot_that_is_not_positive_is_told(one_by_one, step, crowd):
+    if one_by_one:
+        crowd.model = dataclasses.replace(crowd.model, plan=by_elements(crowd.model.plan))
     assert crowd.factorise(1e-5, 0.9).singular.numpy()[0] == 0
     assert crowd.factorise(step, 0.9).singular.numpy()[0] == 1
 

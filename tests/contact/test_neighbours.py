@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from warpflag_kernels.contact import neighbours, search, steric
+import warp as wp
+from warpflag_kernels.contact import neighbours, pair_forces, search
 
 from tests.helpers import cell, touching_cell, unit
 from tests.oracles import CUTOFF, segment_distances
@@ -40,13 +41,13 @@ class Cells:
         self.flagellum, self.cell = m.flagellum_of.numpy(), m.cell_of.numpy()
         self.first_node, self.first_flagellum = m.first_node.numpy(), m.first_flagellum.numpy()
         self.segments = np.setdiff1d(np.arange(self.model.element_count), self.first_node)
-        self.start = self.data.position.numpy().astype(np.float64)
+        self.start = self.data.pose.position.numpy().astype(np.float64)
 
     def place(self, x: np.ndarray) -> None:
         lengths = np.linalg.norm(np.diff(x, axis=0, prepend=0.0), axis=1)
         lengths[self.first_node[:-1]] = 1.0
-        self.data.position.assign(x)
-        self.data.length.assign(lengths)
+        self.data.pose.position.assign(x)
+        self.data.pose.length.assign(lengths)
 
     def built_at(self) -> np.ndarray:
         """Positions of the nodes when the lists were built."""
@@ -54,10 +55,10 @@ class Cells:
 
     def forces(self) -> np.ndarray:
         """Contact forces on both nodes of every segment and the sum of their magnitudes, from fresh lists or old."""
-        steric.segment_contact(self.model, self.state)
-        steric.steric_magnitudes(self.model, self.state, self.sim._steric)
-        parts = [self.data.steric_first.numpy(), self.data.steric_second.numpy(), self.sim._steric.numpy()[:, None]]
-        return np.hstack(parts)
+        magnitude = wp.zeros(self.model.element_count, dtype=self.model.precision.real, device=self.model.device)
+        pair_forces.segment_contact(self.model, self.state)
+        pair_forces.steric_magnitudes(self.model, self.state, magnitude)
+        return np.hstack([self.data.steric_first.numpy(), self.data.steric_second.numpy(), magnitude.numpy()[:, None]])
 
     def forces_without_lists(self) -> np.ndarray:
         """The same with every segment asking all others, as one in a crowd does."""
@@ -141,7 +142,7 @@ def test_forces_of_a_random_walk_are_those_without_lists(device, precision):
         for c in range(5):
             own = b.cell == c
             far = np.linalg.norm(x[own] - before[own], axis=1).max()
-            fresh = np.array_equal(now[own], b.data.position.numpy()[own])
+            fresh = np.array_equal(now[own], b.data.pose.position.numpy()[own])
             assert fresh if far > HALF + TOLERANCE[precision] else (now[own] == before[own]).all()
             builds[c] += fresh
         before = now
@@ -160,7 +161,7 @@ def test_only_the_cell_in_which_a_node_has_moved_too_far_is_listed_anew(share, s
         b.place(x)
         neighbours.refresh(b.model, b.state)
         assert list(b.near.stale.numpy()) == [0, stale, 0, 0, 0]
-        fresh = (b.built_at() == b.data.position.numpy()).all(axis=1)
+        fresh = (b.built_at() == b.data.pose.position.numpy()).all(axis=1)
         assert fresh[e] == bool(stale)
         b.place(b.start)
         b.forces()

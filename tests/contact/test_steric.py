@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.contact import steric
 
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, matrix, placed, shaken, touching_cell, unit

@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from warpflag_kernels.base.types import DeviceModel
+from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.fluid import node_velocity, rotne_prager
 
 from tests.helpers import anchors, attachment, cell, evaluated, free_nodes, placed, shaken, tangents, touching_cell
 from tests.oracles import contact_distances, dense_mobility, device_mobility, drag_coefficients, expected_pair_radius
-from warpflag.model.build import switches_of
+from tests.plans import by_elements, plan
+from warpflag.model.terms import switches_of
 from warpflag.run.simulation import Simulation
 from warpflag.scene import with_values
 from warpflag.scene.resistance import pair_radius
@@ -208,32 +209,37 @@ def ragged(mode: str, precision: str) -> list:
     ]
 
 
-def velocities(scenes: list, device: str, forces: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Velocities of nodes r_1..r_N of a batch under given forces, and whether the pair sum was taken by halves."""
+def velocities(scenes: list, plan: Plan, forces: np.ndarray) -> np.ndarray:
+    """Velocities of nodes r_1..r_N of a batch under given forces, as planned."""
     starts = [shaken(scene, seed, node=0.002) for seed, scene in enumerate(scenes)]
-    sim = Simulation(scenes, device=device, starts=starts)
+    sim = Simulation(scenes, plan=plan, starts=starts)
     sim.evaluate()
     model, state = sim.system.model, sim.system.state
     state.data.active.fill_(1)
     state.data.force.assign(forces[: model.element_count])
     node_velocity.node_velocities(model, state)
     free = np.setdiff1d(np.arange(model.element_count), model.data.first_node.numpy())
-    return state.data.velocity.numpy()[free].astype(np.float64), node_velocity.sums_by_halves(model)
+    return state.data.velocity.numpy()[free].astype(np.float64)
 
 
+@pytest.mark.parametrize("pairs", ["same", "float32"])
 @pytest.mark.parametrize("mode", ["within", "between", "all"])
-def test_the_sum_by_halves_is_the_sum_over_all(mode, precision, device, monkeypatch):
-    """Every pair once for both nodes, as on a CPU, where one thread takes a whole cell, or twice."""
-    if not wp.get_device(device).is_cpu:
-        pytest.skip("pairs are summed by halves on a CPU alone")
-    scenes, forces = ragged(mode, precision), np.random.default_rng(12).uniform(-1, 1, (200, 3))
-    by_halves, halves = velocities(scenes, device, forces)
-    with monkeypatch.context() as patch:
-        patch.setattr(DeviceModel, "one_thread_per_cell", False)
-        gathered, other = velocities(scenes, device, forces)
-    assert halves and not other
-    # To round-off of the type.
-    assert np.abs(by_halves - gathered).max() < 20 * float(np.finfo(precision).eps) * np.abs(gathered).max()
+def test_every_form_of_the_pair_sum_gives_the_same(mode, pairs, precision, device, monkeypatch):
+    """Every pair once for both nodes, as one thread of a CPU does it, or gathered at each, by a thread or by a warp; a
+    CPU's fibers stand for the warp's threads."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    values = {"hydrodynamics.mode": mode, "numerics.pair_precision": pairs}
+    scenes = [with_values(scene, values) for scene in ragged(mode, precision)]
+    forces, own = np.random.default_rng(12).uniform(-1, 1, (200, 3)), plan(scenes[0], device)
+    forms = {"thread": by_elements(own), "warp": by_elements(own, pair_sum="warp")}
+    if wp.get_device(device).is_cpu:
+        forms["symmetric"] = own
+    found = {name: velocities(scenes, form, forces) for name, form in forms.items()}
+    assert own.pair_sum in found
+    # To round-off of the terms' type.
+    digits = 20 * float(np.finfo("float32" if pairs == "float32" else precision).eps)
+    for name, values in found.items():
+        assert np.abs(values - found["thread"]).max() < digits * np.abs(found["thread"]).max(), name
 
 
 SHORT = {"numerics.pair_precision": "float32"}
@@ -241,23 +247,22 @@ SHORT = {"numerics.pair_precision": "float32"}
 
 @pytest.mark.parametrize("form", ["as it comes", "gathered", "strict"])
 @pytest.mark.parametrize("mode", ["within", "between", "all"])
-def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device, monkeypatch):
+def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device):
     """Terms in float32, sums in float64: more nodes lose no more digits."""
-    if form == "gathered":
-        monkeypatch.setattr(DeviceModel, "one_thread_per_cell", False)
     scene = cell({"hydrodynamics.mode": mode, "flagella.count": 3, "flagella.segment_length": 0.02})
     found = []
     for values, real in (({}, np.float64), (SHORT, np.float32)):
-        sim = Simulation(
-            with_values(scene, values), device=device, starts=shaken(scene, 4, node=0.002), strict=form == "strict"
-        )
+        own = with_values(scene, values)
+        planned = by_elements(plan(own, device)) if form == "gathered" else None
+        start = shaken(scene, 4, node=0.002)
+        sim = Simulation(own, device=device, starts=start, strict=form == "strict", plan=planned)
         state = sim.system.state
-        assert len(state.data.position) > 2 * rotne_prager.BLOCK
+        assert len(state.data.pose.position) > 2 * rotne_prager.BLOCK
         found.append(sim.evaluate().velocities)
         assert all(a.numpy().dtype == real for a in (state.pairs.x, state.pairs.fz))
         assert state.data.velocity.numpy().dtype == np.float64
-        by_halves = node_velocity.sums_by_halves(sim.system.model)
-        assert (state.pairs.total_x is not None) == (by_halves and values == SHORT)
+        symmetric = sim.system.model.plan.pair_sum == "symmetric"
+        assert (state.pairs.total_x is not None) == (symmetric and values == SHORT)
     error = np.abs(found[1] - found[0]).max() / np.abs(found[0]).max()
     assert 1e-10 < error < 1e-6
 

@@ -1,15 +1,18 @@
 """The parts of the implicit step, each against NumPy: stiffness, chain chart, linear solves, full equations.
 
-Kernels are driven by hand from one pose, with the buffers of the scene's own stepper. Contacts: `test_contact_law`.
+Kernels are driven by hand from one pose, with the buffers of the scene's own stepper. Contacts: `test_contact_solve`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from warpflag_kernels.fluid import node_velocity
-from warpflag_kernels.implicit import block_band, frozen_flow, linearised, predictor_velocity
+from warpflag_kernels.implicit import first_velocity, linear_system, linearised, step_flow
 from warpflag_kernels.rod import elastic
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from tests.bench import FLOW_TOLERANCE, TOLERANCE, Bench, bench, close, dense_system, displacements, flat, spins
 from tests.helpers import (
@@ -21,7 +24,6 @@ from tests.helpers import (
     tangents,
     unit,
 )
-from warpflag.model.terms import launch_right_hand_side
 
 UNEQUAL = {"flagella.count": 3, "flagellum.1.length": 1.2, "flagellum.1.segments": 5, "flagellum.2.length": 0.8}
 ABLATIONS = {
@@ -42,9 +44,9 @@ def joint_arrays(b: Bench, nodes: np.ndarray, m: np.ndarray, spins: np.ndarray) 
     t = np.vstack([unit(m), unit(segments)])
     followed = carried(e1, base_t, t)
     followed = followed * np.cos(spins)[:, None] + np.cross(t, followed) * np.sin(spins)[:, None]
-    b.data.tangent.assign(t)
-    b.data.director.assign(followed)
-    b.data.length.assign(np.concatenate([[1.0], np.linalg.norm(segments, axis=1)]))
+    b.data.pose.tangent.assign(t)
+    b.data.pose.director.assign(followed)
+    b.data.pose.length.assign(np.concatenate([[1.0], np.linalg.norm(segments, axis=1)]))
     elastic.joint_gradients(b.model, b.state)
     d = b.data
     found = (d.joint_before, d.joint_after, d.joint_spin_before, d.joint_spin_after)
@@ -56,7 +58,7 @@ def test_joint_stiffness_is_the_derivative_of_the_joint_gradients(device, precis
     shake = {"node": 0.02, "spin": 0.3}
     oracle, b = (bench(values, p, device, **shake) for p in ("float64", precision))
     b.factorise(1e-5, 1.0)
-    k, step, n = b.stepper._stiffness, 1e-6, b.count
+    k, step, n = b.stepper.stiffness, 1e-6, b.count
     m = tangents(oracle.scene, oracle.start)[0][0]
 
     def derivative(segment: int, axis: int) -> list[np.ndarray]:
@@ -105,7 +107,8 @@ def test_stiffness_times_increment_is_the_change_of_the_forces_along_the_chain_c
 
     def forces(scale: float) -> list[np.ndarray]:
         exact.retract(exact.increment(body, nodes), scale)
-        launch_right_hand_side(exact.stepper._contactless, exact.state)
+        smooth = tuple(term for term in exact.model.terms if not term.contact)
+        launch_right_hand_side(dataclasses.replace(exact.model, terms=smooth), exact.state)
         d = exact.data
         return [a.numpy().copy() for a in (d.flagellum_force, d.flagellum_torque, d.force, d.spin_torque)]
 
@@ -114,7 +117,7 @@ def test_stiffness_times_increment_is_the_change_of_the_forces_along_the_chain_c
     force, torque, node_forces, spin_torques = ((x - y) / (2 * step) for x, y in ends)
     _, _, forces_now, torques_now = forces(0.0)
     d, first = exact.data, b.first
-    t, y, length, bearing = (a.numpy() for a in (d.tangent, d.position, d.length, d.joint_before))
+    t, y, length, bearing = (a.numpy() for a in (d.pose.tangent, d.pose.position, d.pose.length, d.joint_before))
     m, w, motor = t[first], body[3:], np.array([spec.torque for spec in b.scene.resolved_flagella()])
     torques_now[first] -= motor  # what is left is of the joints
 
@@ -177,7 +180,7 @@ def test_retraction_and_transport_are_those_of_a_chain_of_rotations(device, prec
     positions, directors, centre, orientation, moved = numpy_retraction(b, 0.7 * body, 0.7 * nodes, others)
     # The body's own part is carried unchanged, so a carried body that moves as the pose does.
     out = b.retract(b.increment(body, nodes), 0.7, b.increment(0.7 * body, others))
-    d = b.data
+    d = b.data.pose
     for found, exact in (
         (d.position.numpy(), positions),
         (d.director.numpy(), directors),
@@ -206,7 +209,7 @@ def test_a_rigid_rotation_of_everything_is_exact_and_strains_nothing(device, pre
     turn, free = rotation(w), np.setdiff1d(np.arange(b.count), b.first)
     # A rigid motion that is carried stays one of the chain: its differences turn along.
     out = b.retract(b.increment(body, nodes), 1.0, b.increment(body, nodes))
-    d, e1 = b.data, np.concatenate(b.start.directors)
+    d, e1 = b.data.pose, np.concatenate(b.start.directors)
     assert close(d.position.numpy(), y @ turn.T, precision)
     assert close(d.director.numpy()[free], e1[free] @ turn.T, precision)
     assert close(out.node.numpy()[free, :3], u + np.cross(w, y[free] @ turn.T), precision)
@@ -238,7 +241,7 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
     system = dense_system(exact, step, weight)
     right = system @ x
     y = b.increment(right[:6], right[6:].reshape(-1, 4))
-    block_band.solve(b.model, b.state, band, y)
+    linear_system.solve(b.model, b.state, band, y)
     assert band.singular.numpy()[0] == 0
     # The condition of the matrix grows as h^-4, which leaves float32 two digits on the finest mesh.
     digits = max(1.0, (0.1 / h) ** 4) if precision == "float32" else 1.0
@@ -260,14 +263,14 @@ def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_s
     random, fixed = np.random.default_rng(6), (6 + 4 * b.first[:, None] + np.arange(3)).ravel()
     system = np.eye(6 + 4 * b.count) / step + gain * exact.mobility() @ exact.hessian()
     inverse, s = exact.local_inverse(), b.stepper
-    s._law.gain.fill_(gain)
+    s.law.gain.fill_(gain)
     if mode != "none":
-        frozen_flow.build(b.model, b.state, s._flow)
+        step_flow.build(b.model, b.state, s.flow)
 
     def applied(x: np.ndarray) -> np.ndarray:
         out = b.increment()
         given = b.increment(x[:6], x[6:].reshape(-1, 4))
-        linearised.apply(b.model, b.state, s._stiffness, band, s._flow, s._law.gain, given, out)
+        linearised.apply(b.model, b.state, s.stiffness, band, s.flow, s.law.gain, given, out)
         return flat(out)
 
     x = random.uniform(-1, 1, 6 + 4 * b.count)
@@ -281,23 +284,23 @@ def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_s
     for _ in range(50):
         missing = inverse @ velocities - applied(x)
         y = b.increment(missing[:6], missing[6:].reshape(-1, 4))
-        block_band.solve(b.model, b.state, band, y)
+        linear_system.solve(b.model, b.state, band, y)
         x += flat(y)
     for part in parts:
         assert close(x[part], solution[part], precision, 1.0, FLOW_TOLERANCE)
 
 
 @pytest.mark.parametrize("mode", ["all", "within", "between"])
-def test_rough_velocities_are_those_of_the_pair_sum_in_single_precision(mode, device, precision):
+def test_first_velocities_are_those_of_the_pair_sum_in_single_precision(mode, device, precision):
     b = bench({**UNEQUAL, "hydrodynamics.mode": mode}, precision, device)
-    if not predictor_velocity.serves(b.model):
+    if not first_velocity.serves(b.model):
         pytest.skip("where a thread does not sum a whole cell, no coefficients are kept")
-    frozen_flow.build(b.model, b.state, b.stepper._flow)
+    step_flow.build(b.model, b.state, b.stepper.flow)
     b.data.force.assign(np.random.default_rng(8).uniform(-1, 1, (b.count, 3)))
     node_velocity.node_velocities(b.model, b.state)
     free = np.setdiff1d(np.arange(b.count), b.first)
     exact = b.data.velocity.numpy()[free].copy()
     b.data.velocity.zero_()
-    predictor_velocity.node_velocities(b.model, b.state, b.stepper._flow)
+    first_velocity.node_velocities(b.model, b.state, b.stepper.flow)
     found = b.data.velocity.numpy()[free]
     assert 0.0 < np.abs(found - exact).max() < 2e-6 * np.abs(exact).max()

@@ -68,11 +68,11 @@ def test_pair_radius_is_the_filaments_as_printed_and_larger_otherwise(device):
     radii = {}
     for mode in ("as_printed", "all"):
         sim = Simulation(cell({"hydrodynamics.mode": mode}), device=device)
-        radii[mode] = sim.system.model.data.pair_radius.numpy()[0]
+        radii[mode] = sim.system.model.data.pairs.radius.numpy()[0]
     assert radii["as_printed"] == 0.010
     assert np.isclose(radii["all"], 2.8e-3 * 0.2 / (6 * np.pi * 1e-3), rtol=1e-12)
     given = Simulation(cell({"hydrodynamics.pair_radius": 0.05}), device=device)
-    assert given.system.model.data.pair_radius.numpy()[0] == 0.05
+    assert given.system.model.data.pairs.radius.numpy()[0] == 0.05
 
 
 def test_steric_off_leaves_flagella_without_contact_forces(device, precision):

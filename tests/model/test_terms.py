@@ -12,11 +12,12 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
-from warpflag_kernels.base.types import DeviceModel
+from warpflag_kernels.stepping.right_hand_side import stages
+from warpflag_kernels.stepping.terms import TERMS as KERNEL_TERMS
 
 from tests.helpers import cell
-from warpflag.model.build import switches_of
-from warpflag.model.terms import right_hand_side
+from tests.plans import as_on_gpu, plan
+from warpflag.model.terms import SCENE_TERMS
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene
 
@@ -32,14 +33,16 @@ TERMS = {
 def launches(scene: Scene, monkeypatch: pytest.MonkeyPatch, by_cells: bool = False) -> list[Any]:
     """Kernels that one pass, an evaluation and a look at the state launch, in order.
 
-    by_cells: cut as for a CPU, else by stages.
+    Args:
+        scene: of the simulation.
+        monkeypatch: puts a recorder in place of Warp's launch.
+        by_cells: cut as for a CPU, else by stages, as for a GPU.
     """
     kernels: list[Any] = []
-    sim = Simulation(scene, device="cpu")
+    own = plan(scene, "cpu")
+    sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own))
     sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
     with monkeypatch.context() as patch:
-        if not by_cells:
-            patch.setattr(DeviceModel, "one_thread_per_cell", False)
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.append(kernel))
         sim.stepper.launch_pass()
         sim.evaluate()
@@ -57,11 +60,16 @@ def variants_of(kernels: list[Any], stage: str) -> set[str]:
     return {name.partition(".fast")[2].lstrip(".") for name in names}
 
 
+def test_scenes_know_the_terms_that_kernels_have():
+    assert [term.name for term in SCENE_TERMS] == [term.name for term in KERNEL_TERMS]
+
+
 @pytest.mark.parametrize("term", TERMS)
 def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypatch):
     values, stage, modules, arrays = TERMS[term]
     with_it, without = cell(), cell(values)
-    names = [[s.name for s in right_hand_side(switches_of(scene))] for scene in (with_it, without)]
+    models = [Simulation(scene, device="cpu").system.model for scene in (with_it, without)]
+    names = [[name for name, _launch in stages(model)] for model in models]
     assert names[1] == [name for name in names[0] if name != stage]
     for scene, present in ((with_it, True), (without, False)):
         assert stages_of(launches(scene, monkeypatch)) & modules == (modules if present else set())
@@ -71,17 +79,15 @@ def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypat
 
 
 def test_on_a_cpu_the_right_hand_side_is_one_launch(monkeypatch):
-    scene, stages = (
-        cell({"numerics.stepper": "rkc"}),
-        {"elastic", "steric", "steric_body", "forces", "body", "mobility"},
-    )
-    assert not stages_of(launches(scene, monkeypatch, by_cells=True)) & stages
-    assert stages_of(launches(scene, monkeypatch)) >= stages
+    scene = cell({"numerics.stepper": "rkc"})
+    parts = {"elastic", "steric", "steric_body", "forces", "body", "mobility"}
+    assert not stages_of(launches(scene, monkeypatch, by_cells=True)) & parts
+    assert stages_of(launches(scene, monkeypatch)) >= parts
 
 
 def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
     implicit = {"numerics.stepper": "implicit"}
-    solver = {"contacts", "contact_search", "contact_law"}
+    solver = {"contacts", "contact_search", "contact_solve"}
     assert stages_of(launches(cell(implicit), monkeypatch)) & solver == solver
     off = {"steric.enabled": False, "body.contact": False, **implicit}
     assert not stages_of(launches(cell(off), monkeypatch)) & solver
@@ -89,30 +95,33 @@ def test_an_implicit_step_without_contacts_has_no_contact_solver(monkeypatch):
 
 @pytest.mark.parametrize("mode", ["none", "within", "between", "all"])
 def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
-    scene = cell({"hydrodynamics.mode": mode})
-    assert variants_of(launches(scene, monkeypatch), "mobility") == {f"{mode}_thread"}
-    assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{mode}_steric_body_bearing"}
+    scene, gathered = cell({"hydrodynamics.mode": mode}), "none" if mode == "none" else "warp"
+    assert variants_of(launches(scene, monkeypatch), "mobility") == {f"{mode}_{gathered}"}
+    own = "none" if mode == "none" else "symmetric"
+    terms = "motor_elastic_bearing_steric_body_contact"
+    assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{terms}_{mode}_{own}"}
     model = Simulation(scene, device="cpu").system.model.data
-    assert (model.pair_radius is None) == (mode == "none")
+    assert (model.pairs.radius is None) == (mode == "none")
 
 
 def test_a_single_flagellum_has_no_partner(monkeypatch):
     scene = cell({"flagella.count": 1})
     kernels, both = launches(scene, monkeypatch), launches(cell(), monkeypatch)
-    assert variants_of(kernels, "mobility") == {"within_thread"}
+    assert variants_of(kernels, "mobility") == {"within_warp"}
     assert not stages_of(kernels) & {"steric", "steric_measure"}
     crossings = [[k for k in found if k.func.__name__ == "check_crossings"] for found in (kernels, both)]
     assert [len(found) for found in crossings] == [0, 1]
     assert Simulation(scene, device="cpu").system.guard.position is None
     between = cell({"flagella.count": 1, "hydrodynamics.mode": "between"})
-    assert variants_of(launches(between, monkeypatch), "mobility") == {"none_thread"}
+    assert variants_of(launches(between, monkeypatch), "mobility") == {"none_none"}
 
 
 @pytest.mark.parametrize("stepper", ["rkc", "euler", "implicit"])
 def test_a_stepper_brings_only_its_own_kernels(stepper, monkeypatch):
     stages = stages_of(launches(cell({"numerics.stepper": stepper}), monkeypatch))
-    assert stages & {"rkc", "euler", "implicit"} == {stepper}
-    assert ("banded" in stages) == (stepper == "implicit")
+    own = {"implicit": "collocation"}
+    assert stages & {"rkc", "euler", "collocation"} == {own.get(stepper, stepper)}
+    assert ("block_band" in stages) == (stepper == "implicit")
 
 
 def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
@@ -127,19 +136,19 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     loaded = set(re.findall(r"Module warpflag_kernels\.(\S+) \S+ load on", said))
     assert loaded == {
-        "control",
+        "clock",
         "rkc.float64.fast",
-        "placing.float64.fast",
+        "reconstruction.float64.fast",
         "chart.float64.fast",
-        "whole_cell.float64.fast.none_bearing",
+        "whole_cell.float64.fast.motor_elastic_bearing_none_none",
         "elastic_energy.float64.fast",
-        "guard.float64.fast",
+        "health.float64.fast",
     }
 
 
 def kernel_functions(tree: ast.Module) -> list[ast.FunctionDef]:
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    return [f for f in functions if any("kernel" in ast.unparse(d) for d in f.decorator_list)]
+    return [f for f in functions if any("wp.kernel" in ast.unparse(d) for d in f.decorator_list)]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

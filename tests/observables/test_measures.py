@@ -203,10 +203,11 @@ def test_power_balance_is_motor_work_dissipation_and_stored_energy():
     simulation.advance(1e-5)
     start = as_start(scene, simulation.cell_state())
     found = evaluated(scene, start, "cpu")
+    balance = observables.power_balance(found)
     turned = start.body_orientation
     matrix = rotation(2 * math.acos(min(turned[3], 1.0)) * turned[:3] / max(np.linalg.norm(turned[:3]), 1e-300))
     axes = observables.motor_axes(scene) @ matrix.T
-    balance = observables.power_balance(found, np.full(2, 5.0), axes, np.array([0, 11, 22]))
+    assert balance.supplied == {"motor": pytest.approx(5.0 * (found.spins[[0, 11]] - axes @ found.body_spin).sum())}
     assert min(balance.motor, balance.translation, balance.spin, balance.body) > 0.0
 
     def at(time):

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.rod import rotations
 
 

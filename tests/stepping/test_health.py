@@ -257,10 +257,10 @@ def place(sim: Simulation, nodes: np.ndarray) -> None:
     lengths[:, :, 1:] = np.linalg.norm(segments, axis=-1)
     tangents = np.tile([0.0, 0.0, 1.0], (COUNT, 2, 3, 1))
     tangents[:, :, 1:] = segments / lengths[:, :, 1:, None]
-    data.position.assign(nodes.reshape(-1, 3))
-    data.length.assign(lengths.ravel())
-    data.tangent.assign(tangents.reshape(-1, 3))
-    data.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
+    data.pose.position.assign(nodes.reshape(-1, 3))
+    data.pose.length.assign(lengths.ravel())
+    data.pose.tangent.assign(tangents.reshape(-1, 3))
+    data.pose.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
     data.active.fill_(1)
 
 
@@ -271,9 +271,9 @@ def seen(sim: Simulation, before: np.ndarray, after: np.ndarray, looked_at: floa
     """
     s, listed = sim.system, None
     if looked_at is not None:
-        listed = sim.stepper._contacts
+        listed = sim.stepper.contacts
         place(sim, before + looked_at * (after - before))
-        search.find(s.model, s.state, sim.stepper._now, listed)
+        search.find(s.model, s.state, s.state.data.pose, listed)
     place(sim, after)
     s.guard.position.assign(before.reshape(-1, 3))
     for flags in (s.chart.commit, s.chart.rest):

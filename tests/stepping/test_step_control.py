@@ -81,7 +81,7 @@ def test_every_attempt_is_a_step_or_a_rejected_one(device, precision):
 def test_a_rejected_step_leaves_no_trace(device):
     """Steps that fail one after another leave the cell where it was."""
     sim = advanced(zipping(implicit(5e-6)), window("contact", device), 2e-5, device)
-    first, before, rejected = sim.stepper._contacts.first, sim.cell_state(), counts(sim)[1]
+    first, before, rejected = sim.stepper.contacts.first, sim.cell_state(), counts(sim)[1]
     memory = sim.checkpoint()
     first.assign(np.array([0, 1]))  # no room for the contacts: nothing can be solved
     with pytest.raises(NumericalError) as caught:
@@ -98,7 +98,7 @@ def test_after_a_jump_of_the_torque_a_restart_begins_small_and_follows(device):
     scene = zipping(implicit(accuracy=5e-3))
     sim = advanced(scene, window("free", device), 1e-4, device)
     usual = sim.system.control.step.numpy()[0]
-    start, torque = reached(sim), sim.system.model.data.motor_torque
+    start, torque = reached(sim), sim.system.model.data.motor.torque
     torque.assign(2.0 * torque.numpy())
     sim.stepper.restart()
     steps, time = sim.steps[0], sim.times[0]
@@ -115,7 +115,7 @@ def test_a_jump_that_nobody_announces_is_noticed(stepper, device):
     """Without a restart: the estimate sees it and steps are rejected, though only a restart keeps the full accuracy."""
     scene = zipping(controlled(stepper, 5e-3))
     sim = advanced(scene, window("free", device), 1e-4, device)
-    start, torque, rejected = reached(sim), sim.system.model.data.motor_torque, counts(sim)[1]
+    start, torque, rejected = reached(sim), sim.system.model.data.motor.torque, counts(sim)[1]
     torque.assign(3.0 * torque.numpy())
     sim.advance(1.5e-4)
     oracle = advanced(with_values(scene, {"motor.torque": 10.2, "numerics.accuracy": 2e-4}), start, 5e-5, device)
@@ -172,7 +172,7 @@ def test_an_impossible_scene_ends_soon_and_with_a_reason(stepper, name, device, 
 def test_a_cell_whose_steps_cannot_be_solved_says_so_and_its_neighbours_go_on(device, precision):
     scenes = [make(implicit(accuracy=5e-3), precision) for make in (touching_cell, cell)]
     batch, alone = Simulation(scenes, device=device), Simulation(scenes[1], device=device)
-    first = batch.stepper._contacts.first
+    first = batch.stepper.contacts.first
     first.assign(first.numpy() + np.array([first.numpy()[1] - 1, 0, 0]))  # no room in the first cell
     with pytest.raises(NumericalError) as caught:
         batch.advance(2e-5)

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from tests.helpers import anchors, as_start, cell, displaced, free_nodes, shaken, touching_cell
 from warpflag.model.geometry import InitialState
-from warpflag.model.terms import launch_right_hand_side
 from warpflag.run.simulation import CellState, Simulation
 from warpflag.scene import Scene, with_values
 
@@ -87,8 +87,9 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
         c.body_increment.assign(body + shift * rates[1])
         c.elapsed.fill_(1e-5 + shift)
         state.data.active.fill_(1)
-        reconstruction.place(model, state, c)
-        return tuple(a.numpy().copy() for a in (state.data.position, state.data.director, state.data.body_position))
+        reconstruction.reconstruct(model, state, c)
+        pose = state.data.pose
+        return tuple(a.numpy().copy() for a in (pose.position, pose.director, pose.body_position))
 
     rates = np.zeros_like(nodes), np.zeros_like(body)
     _, directors, _ = place(0.0)
@@ -96,10 +97,10 @@ def test_increment_rates_carry_the_state_exactly_as_it_moves(device):
     comoving_chart.increment_rates(model, state, c)
     rates = c.rate.numpy().copy(), c.body_rate.numpy().copy()
     s = state.data
-    tangents, velocities, spin = s.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
-    spins = model.data.spin_mobility.numpy()[0] * s.spin_torque.numpy()
+    tangents, velocities, spin = s.pose.tangent.numpy().copy(), s.velocity.numpy().copy(), s.body_spin.numpy()[0].copy()
+    spins = model.data.drag.spin_mobility.numpy()[0] * s.spin_torque.numpy()
     centre_velocity = s.body_velocity.numpy()[0].copy()
-    along = np.diff(velocities, axis=0, prepend=0) / s.length.numpy()[:, None]
+    along = np.diff(velocities, axis=0, prepend=0) / s.pose.length.numpy()[:, None]
     along[first] = np.cross(spin, tangents[first])  # the tripod's axis turns with the body
     turning = np.cross(tangents, along) + spins[:, None] * tangents
     step = 1e-12
@@ -249,7 +250,7 @@ def test_stage_count_follows_the_stiffness_during_a_run(device):
     scene = cell({"motor.torque": 1.0})
     sim = Simulation(scene, device=device)
     sim.advance(2e-5)
-    hook = sim.system.model.data.hook_rigidity
+    hook = sim.system.model.data.rod.hook_rigidity
     radius, stages = sim.stepper.memory()["spectral_radius"][0], sim.stepper.data.stages.numpy()[0]
     for step in range(24):  # the hook, whose twist is the fastest motion, ten times stiffer by 10 % a step
         hook.assign(hook.numpy() * 1.1)

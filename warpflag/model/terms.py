@@ -1,48 +1,103 @@
-"""The stages of one right-hand side that a scene requires, in order. A stage it does not need does not exist here."""
+"""The force terms that scenes ask for: when each is needed, what it takes from a scene, and the power it brings in.
+
+What a term does to a cell is device code, `warpflag_kernels.stepping.terms`; the names there and here are the same.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Switches
-from warpflag_kernels.contact import steric
-from warpflag_kernels.fluid import body, node_velocity
-from warpflag_kernels.rod import elastic, forces
-from warpflag_kernels.stepping import whole_cell
+import numpy as np
+import warp as wp
+from warpflag_kernels.base.plan import Switches
 
-__all__ = ["Stage", "launch_right_hand_side", "right_hand_side"]
+from warpflag.record.cell_state import Evaluation
+from warpflag.scene import Scene
+
+__all__ = ["SCENE_TERMS", "SceneTerm", "supplied_power", "switches_of"]
 
 
 @dataclass(frozen=True)
-class Stage:
-    """One step of the right-hand side: its name and the function that launches its kernels."""
+class SceneTerm:
+    """What a term of the forces takes from scenes.
+
+    Attributes:
+        name: of the device term.
+        needed: whether a scene has it.
+        fill: fills the struct `Model` of a batch, `fill(scenes, precision, device, data)`; None: nothing of its own.
+        power: power that it brings into one cell [pN um/s], `power(scene, evaluation)`. None: it stores energy, or
+            does no work.
+    """
 
     name: str
-    launch: Callable[[DeviceModel, DeviceState], None]
+    needed: Callable[[Scene], bool]
+    fill: Callable[[Sequence[Scene], Any, Any, Any], None] | None = None
+    power: Callable[[Scene, Evaluation], float] | None = None
 
 
-def right_hand_side(switches: Switches) -> tuple[Stage, ...]:
-    """From positions and directors to velocities: the stages that these switches ask for."""
-    stages = [Stage("elastic", elastic.joint_gradients)]
-    if switches.steric:
-        stages.append(Stage("steric", steric.segment_contact))
-    if switches.body_contact:
-        stages.append(Stage("body contact", steric.body_contact))
-    terms = switches.pairs + (", terms in float32" if switches.short_pairs else "")
-    pairs = "local drag" if switches.pairs == "none" else f"local drag and pair sum ({terms})"
-    stages += [
-        Stage("forces", forces.total_forces),
-        Stage("body", body.body_motion),
-        Stage(pairs, node_velocity.node_velocities),
-    ]
-    return tuple(stages)
+def _motor_power(scene: Scene, found: Evaluation) -> float:
+    """Of T_m on each tripod and -T_m m on the body."""
+    torques = np.array([spec.torque for spec in scene.resolved_flagella()])
+    turns = found.spins[found.first] - found.tangents[found.first] @ found.body_spin
+    return float(torques @ turns)
 
 
-def launch_right_hand_side(model: DeviceModel, state: DeviceState) -> None:
-    """Forces, torques and velocities at the current evaluation point: on a CPU in one launch, else stage by stage."""
-    if model.one_thread_per_cell:
-        whole_cell.right_hand_side(model, state)
-        return
-    for stage in right_hand_side(model.switches):
-        stage.launch(model, state)
+def _external_forces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(scene.external.force_per_length), np.array(scene.external.body_force)
+
+
+def _fill_external(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+    per_length, on_body = zip(*map(_external_forces, scenes), strict=True)
+    data.external.force_per_length = wp.array(np.array(per_length), dtype=precision.vec3, device=device)
+    data.external.body_force = wp.array(np.array(on_body), dtype=precision.vec3, device=device)
+
+
+def _external_power(scene: Scene, found: Evaluation) -> float:
+    """Every node carries half of the reference length of each of its segments."""
+    per_length, on_body = _external_forces(scene)
+    flagella = scene.resolved_flagella()
+    lengths = np.repeat([spec.segment_length for spec in flagella], [spec.segment_count + 1 for spec in flagella])
+    last = np.append(found.first[1:], len(lengths)) - 1
+    lengths[found.first] /= 2
+    lengths[last] /= 2
+    return float(lengths @ (found.velocities @ per_length) + on_body @ found.body_velocity)
+
+
+def _several(scene: Scene) -> bool:
+    return len(scene.resolved_flagella()) > 1
+
+
+SCENE_TERMS = (
+    SceneTerm("motor", lambda scene: True, power=_motor_power),
+    SceneTerm("elastic", lambda scene: True),
+    SceneTerm("bearing", lambda scene: scene.motor.bearing_torque),
+    SceneTerm("steric", lambda scene: scene.steric.enabled and _several(scene)),
+    SceneTerm("body contact", lambda scene: scene.body.contact),
+    SceneTerm(
+        "external",
+        lambda scene: any(map(np.any, _external_forces(scene))),
+        fill=_fill_external,
+        power=_external_power,
+    ),
+)
+
+
+def switches_of(scene: Scene) -> Switches:
+    """The terms that a scene requires: a single flagellum has no contact partner and no pairs between flagella."""
+    pairs = {"as_printed": "all", "consistent": "all"}.get(scene.hydrodynamics.mode, scene.hydrodynamics.mode)
+    if not _several(scene):
+        pairs = {"all": "within", "between": "none"}.get(pairs, pairs)
+    numerics = scene.numerics
+    return Switches(
+        pairs=pairs,
+        terms=tuple(term.name for term in SCENE_TERMS if term.needed(scene)),
+        short_pairs=pairs != "none" and (numerics.precision, numerics.pair_precision) == ("float64", "float32"),
+    )
+
+
+def supplied_power(scene: Scene, found: Evaluation) -> dict[str, float]:
+    """Power that each term of a scene brings into a cell [pN um/s], by the term's name."""
+    terms = [term for term in SCENE_TERMS if term.power is not None and term.needed(scene)]
+    return {term.name: term.power(scene, found) for term in terms if term.power is not None}

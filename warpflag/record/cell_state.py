@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,9 @@ class Evaluation:
         torques: on the spins about the tangents [pN um], shape [node_count].
         velocities: of the nodes in the lab [um/s], shape [node_count, 3].
         spins: of the segments about their tangents [rad/s], shape [node_count].
+        tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
+        first: index of r_0 of every flagellum, shape [flagellum_count].
+        supplied: power of motors and of external forces [pN um/s], by the name of the term.
         body_force: sum of the forces on the body [pN], shape [3].
         body_torque: sum of the torques on the body about its centre [pN um], shape [3].
         body_velocity: of the body's centre [um/s], shape [3].
@@ -59,6 +63,9 @@ class Evaluation:
     torques: np.ndarray
     velocities: np.ndarray
     spins: np.ndarray
+    tangents: np.ndarray
+    first: np.ndarray
+    supplied: Mapping[str, float]
     body_force: np.ndarray
     body_torque: np.ndarray
     body_velocity: np.ndarray

@@ -6,9 +6,8 @@ from time import perf_counter
 from typing import Any
 
 import warp as wp
+from warpflag_kernels.stepping.right_hand_side import stages
 
-from warpflag.model.build import switches_of
-from warpflag.model.terms import right_hand_side
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, dumps
 
@@ -26,13 +25,15 @@ def report(scene: Scene, device: str | None = None) -> str:
     flagella = scene.resolved_flagella()
     segments = sum(spec.segment_count for spec in flagella)
     nodes = segments + len(flagella)
-    stages = ", ".join(stage.name for stage in right_hand_side(switches_of(scene)))
+    model = simulation.system.model
+    names = ", ".join(name for name, _launch in stages(model))
     longest = float(simulation.system.control.longest_step.numpy()[0])
     values_per_frame = 6 * nodes + 2 * len(flagella) + 14
     cost = _computing_time(simulation, longest)
     lines = [
         f"{len(flagella)} flagella, {segments} segments, {nodes} nodes",
-        f"stages of a right-hand side: {stages}",
+        f"stages of a right-hand side: {names}",
+        f"plan: {model.plan.summary()}",
         f"device {simulation.device.alias} ({simulation.device.name}), {scene.numerics.precision}",
         f"memory {_mebibytes(_device_bytes(simulation))} on the device, "
         f"record {_mebibytes(8 * values_per_frame * (scene.frames + 1))}",

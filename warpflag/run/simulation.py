@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,16 +11,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock as control_stage
-from warpflag_kernels.base.types import Precision
-from warpflag_kernels.contact import steric
+from warpflag_kernels.base.plan import Plan
+from warpflag_kernels.contact import pair_forces
 from warpflag_kernels.rod import elastic, reconstruction
 from warpflag_kernels.stepping import health
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.base.device import find_device
-from warpflag.model.build import build_chart, build_control, build_guard, build_model, build_state
+from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import starting_state
-from warpflag.model.terms import launch_right_hand_side
+from warpflag.model.terms import supplied_power
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, start_reporter
@@ -33,10 +35,8 @@ __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 _SECONDS_PER_REPLAY = 0.2
 _ROUNDING = 1e-6  # of a frame interval: times this close are the same
 # Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
-_CARRIED = (
-    *("base_position", "base_tangent", "base_director", "base_body_position", "base_body_orientation"),
-    *("flagellum_spin", "motor_angle", "body_angle"),
-)
+_KEPT_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
+_KEPT_CHART = ("flagellum_spin", "motor_angle", "body_angle")
 
 
 class Simulation:
@@ -49,6 +49,7 @@ class Simulation:
         reporters: take the frames of the next `run` of a single scene, and are closed and let go at its end.
         capture: replay a captured pass (the default) or launch every kernel from Python; same numbers.
         strict: kernels built without reassociation, for comparisons to the last bit.
+        plan: how kernels are executed, in place of what is chosen for the device; then neither `device` nor `strict`.
 
     Errors:
         SceneError: a scene can't be simulated.
@@ -65,18 +66,18 @@ class Simulation:
         reporters: Sequence[Reporter] = (),
         capture: bool = True,
         strict: bool = False,
+        plan: Plan | None = None,
     ) -> None:
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         if starts is None:
             starts = [starting_state(scene) for scene in self.scenes]
         elif isinstance(starts, InitialState):
             starts = [starts]
-        precision = Precision(self.scenes[0].numerics.precision, strict)
-        model = build_model(self.scenes, find_device(device), precision)
-        self.device = model.device
+        model = build_model(self.scenes, plan or plan_of(self.scenes, find_device(device), strict))
+        self.device, precision = model.device, model.precision
         state = build_state(model)
         chart = build_chart(model, starts)
-        self.system = System(model, state, chart, build_control(model, starts), build_guard(model, chart))
+        self.system = System(model, state, chart, build_control(model, starts), health.allocate(model, chart))
         self.stepper = make_stepper(self.system, self.scenes)
         self.first_node = model.data.first_node.numpy()
         self._first_flagellum = model.data.first_flagellum.numpy()
@@ -136,7 +137,7 @@ class Simulation:
         scene, first_node = self.scenes[0], self.first_node
         length = float(np.mean([spec.length for spec in scene.resolved_flagella()]))
         if self._framed is None:
-            self._framed = self._placed_state()
+            self._framed = self._present_state()
             yield frame_of(self._framed, None, first_node, length)
         k = math.floor(float(self.times[0]) / scene.duration * scene.frames + _ROUNDING)
         last = math.floor(until / scene.duration * scene.frames + _ROUNDING)
@@ -196,22 +197,22 @@ class Simulation:
         """One cell on the host, at the time it has reached; valid after `advance`."""
         s, chart, model = self.system.state, self.system.chart, self.system.model
         flagella, nodes = self._own(cell)
-        centre = chart.base_body_position.numpy()[cell]
+        centre = chart.base.body_position.numpy()[cell]
         elastic.elastic_energy(model, s, self._energy)
         steric_force = 0.0
-        if model.switches.steric:
-            steric.steric_magnitudes(model, s, self._steric)
+        if model.switches.has("steric"):
+            pair_forces.steric_magnitudes(model, s, self._steric)
             steric_force = 0.5 * float(self._steric.numpy()[nodes].sum(dtype=np.float64))
         return CellState(
             time=float(self.times[cell]),
             step=int(self.steps[cell]),
-            positions=chart.base_position.numpy()[nodes].astype(np.float64) + centre,
-            directors=chart.base_director.numpy()[nodes].astype(np.float64),
-            tangents=chart.base_tangent.numpy()[nodes].astype(np.float64),
+            positions=chart.base.position.numpy()[nodes].astype(np.float64) + centre,
+            directors=chart.base.director.numpy()[nodes].astype(np.float64),
+            tangents=chart.base.tangent.numpy()[nodes].astype(np.float64),
             motor_angle=chart.motor_angle.numpy()[flagella].copy(),
             body_angle=float(chart.body_angle.numpy()[cell]),
             body_position=centre.copy(),
-            body_orientation=chart.base_body_orientation.numpy()[cell].copy(),
+            body_orientation=chart.base.body_orientation.numpy()[cell].copy(),
             elastic_energy=self._energy.numpy()[nodes].sum(axis=0, dtype=np.float64),
             steric_force=steric_force,
         )
@@ -239,20 +240,21 @@ class Simulation:
             array.assign(arrays[name])
         self.stepper.restart()
         self.stepper.recall(memory)
-        self._framed = self._placed_state()
+        self._framed = self._present_state()
 
     def _carried(self) -> dict[str, Any]:
         control, chart = self.system.control, self.system.chart
         carried = {"control.time": control.time, "control.steps": control.steps}
-        carried |= {f"chart.{name}": getattr(chart, name) for name in _CARRIED}
-        if self.system.model.switches.steric:
+        carried |= {f"chart.base_{name}": getattr(chart.base, name) for name in _KEPT_POSE}
+        carried |= {f"chart.{name}": getattr(chart, name) for name in _KEPT_CHART}
+        if self.system.model.switches.has("steric"):
             carried["guard.position"] = self.system.guard.position
         return carried
 
     def evaluate(self, cell: int = 0) -> Evaluation:
         """Forces and velocities of one cell at its present state; advances nothing."""
         model, s = self.system.model, self.system.state
-        self._place()
+        self._reconstruct()
         launch_right_hand_side(model, s)
         s.data.active.zero_()
         flagella, nodes = self._own(cell)
@@ -261,17 +263,21 @@ class Simulation:
             return array.numpy()[part].astype(np.float64)
 
         torques = host(s.data.spin_torque, nodes)
-        mobility = np.repeat(model.data.spin_mobility.numpy(), np.diff(self.first_node))[nodes]
-        return Evaluation(
+        mobility = np.repeat(model.data.drag.spin_mobility.numpy(), np.diff(self.first_node))[nodes]
+        found = Evaluation(
             forces=host(s.data.force, nodes),
             torques=torques,
             velocities=host(s.data.velocity, nodes),
             spins=mobility * torques,
+            tangents=host(s.data.pose.tangent, nodes),
+            first=self.first_node[flagella] - nodes.start,
+            supplied={},
             body_force=host(s.data.flagellum_force, flagella).sum(axis=0),
             body_torque=host(s.data.flagellum_torque, flagella).sum(axis=0),
             body_velocity=host(s.data.body_velocity, cell),
             body_spin=host(s.data.body_spin, cell),
         )
+        return dataclasses.replace(found, supplied=supplied_power(self.scenes[cell], found))
 
     def _own(self, cell: int) -> tuple[slice, slice]:
         """The flagella and the nodes of one cell."""
@@ -285,24 +291,24 @@ class Simulation:
         while self.system.control.proceed.numpy()[0] > 0:
             self.stepper.launch_pass()
 
-    def _place(self) -> None:
+    def _reconstruct(self) -> None:
         """Puts the evaluation point on the present state; every cell is active afterwards."""
         s, chart = self.system.state, self.system.chart
         s.data.active.fill_(1)
         for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
             array.zero_()
-        reconstruction.place(self.system.model, s, chart)
+        reconstruction.reconstruct(self.system.model, s, chart)
 
-    def _placed_state(self) -> CellState:
+    def _present_state(self) -> CellState:
         """The first cell before any step, or after a state was set from outside."""
-        self._place()
+        self._reconstruct()
         self.system.state.data.active.zero_()
         return self.cell_state()
 
     def _check_start(self) -> None:
         """The guards look at the state that the first step starts from."""
         model, s, chart = self.system.model, self.system.state, self.system.chart
-        self._place()
+        self._reconstruct()
         launch_right_hand_side(model, s)
         chart.rest.fill_(1)
         health.check(model, s, chart, self.system.guard, self.system.control)

@@ -18,6 +18,7 @@ from warpflag.scene import scene_file
 from warpflag.scene.errors import Problems, SceneError, written
 from warpflag.scene.sections import (
     Body,
+    External,
     Flagella,
     FlagellumOverride,
     Fluid,
@@ -31,6 +32,7 @@ from warpflag.scene.settings import Section, Setting, integer, number, text
 
 __all__ = [
     "Body",
+    "External",
     "Flagella",
     "FlagellumOverride",
     "FlagellumSpec",
@@ -102,6 +104,7 @@ class Scene(Section, key=""):
     hydrodynamics: Hydrodynamics = dataclasses.field(default_factory=Hydrodynamics)
     steric: Steric = dataclasses.field(default_factory=Steric)
     body: Body = dataclasses.field(default_factory=Body)
+    external: External = dataclasses.field(default_factory=External)
     numerics: Numerics = dataclasses.field(default_factory=Numerics)
     start: Start = dataclasses.field(default_factory=Start)
 
@@ -225,7 +228,7 @@ def _own(own: Any, group: Any) -> Any:
 
 
 _SECTIONS: dict[str, type[Section]] = {
-    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, Numerics, Start)
+    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
 }
 _KEYS: dict[str, Setting] = {
     f"{cls.key}.{name}".lstrip("."): setting

@@ -175,6 +175,18 @@ class Body(Section, key="body"):
 
 
 @dataclass(frozen=True)
+class External(Section, key="external"):
+    """External forces in lab axes: sedimentation, the pull of a laser trap."""
+
+    force_per_length: tuple[float, float, float] = vector(
+        (0.0, 0.0, 0.0), "pN/um", -1e3, 1e3, "uniform force per contour length on every flagellum"
+    )
+    body_force: tuple[float, float, float] = vector(
+        (0.0, 0.0, 0.0), "pN", -1e4, 1e4, "force on the body, at its centre"
+    )
+
+
+@dataclass(frozen=True)
 class Numerics(Section, key="numerics"):
     """How time is stepped: numerical method, step and precision."""
 

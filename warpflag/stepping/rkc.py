@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.rod import comoving_chart, reconstruction
-from warpflag_kernels.stepping import health, rkc
+from warpflag_kernels.stepping import health, rkc, step_control
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
-from warpflag.model.terms import launch_right_hand_side
 from warpflag.scene import Scene
 from warpflag.scene.resistance import filament_mobility
-from warpflag.stepping.stepper import STEP_MEMORY, System, build_step_control, restart_step_control
+from warpflag.stepping.stepper import STEP_MEMORY, System, restart_step_control
 
 __all__ = ["EULER_STEPS_PER_CHECK", "RKC_STEP", "RkcStepper", "euler_step"]
 
@@ -51,27 +50,11 @@ class RkcStepper:
 
     def __init__(self, system: System, scenes: Sequence[Scene], euler: bool) -> None:
         self._system, self._euler = system, euler
-        model = system.model
-        cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
-        p, device = model.precision, model.device
-        r = rkc.struct(p)()
-
-        def zeros(count: int, dtype: Any) -> wp.array:
-            return wp.zeros(count, dtype=dtype, device=device)
-
-        r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
-        r.body_previous, r.body_before_previous, r.body_start_rate = (
-            zeros(cells, comoving_chart.vec6d) for _ in range(3)
-        )
-        r.stage, r.stages, r.probes_left = (zeros(cells, wp.int32) for _ in range(3))
-        r.evaluations = zeros(cells, wp.int32)
-        r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
-        r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
-        r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
-        self.data = r
+        device = system.model.device
+        self.data = rkc.allocate(system.model)
         fixed = [s.numerics.time_step or s.numerics.accuracy is None or euler for s in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or 0.0 for f, s in zip(fixed, scenes, strict=True)]
-        self.steps = build_step_control(accuracies, device)
+        self.steps = step_control.allocate(accuracies, device)
         longest = [s.numerics.time_step or (euler_step(s) if euler else RKC_STEP) for s in scenes]
         longest = [step if f else LONGEST_STEP for f, step in zip(fixed, longest, strict=True)]
         system.control.longest_step.assign(longest)
@@ -83,7 +66,7 @@ class RkcStepper:
     def launch_pass(self) -> None:
         s = self._system
         rkc.begin_pass(s.model, s.state, s.chart, s.control, self.steps, self.data, self._euler)
-        reconstruction.place(s.model, s.state, s.chart)
+        reconstruction.reconstruct(s.model, s.state, s.chart)
         launch_right_hand_side(s.model, s.state)
         # Most passes are stages inside a step: what happens between steps is not even launched there.
         wp.capture_if(s.control.at_rest, self._launch_between_steps)
@@ -125,7 +108,7 @@ class RkcStepper:
         cell_first = first[model.data.first_flagellum.numpy()]
         probe = np.zeros((model.element_count, 4))
         norms = np.zeros(model.cell_count)
-        h = np.repeat(model.data.segment_length.numpy().astype(np.float64), np.diff(first))
+        h = np.repeat(model.data.rod.segment_length.numpy().astype(np.float64), np.diff(first))
         for c in range(model.cell_count):
             cell = slice(cell_first[c], cell_first[c + 1])
             random = np.random.default_rng(0).standard_normal((cell.stop - cell.start, 4))

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import warp as wp
 from warpflag_kernels.base.types import DeviceModel, DeviceState
-from warpflag_kernels.stepping.step_control import StepControl
 
-__all__ = ["DEFAULT_ACCURACY", "STEP_MEMORY", "Stepper", "System", "build_step_control", "restart_step_control"]
+__all__ = ["DEFAULT_ACCURACY", "STEP_MEMORY", "Stepper", "System", "restart_step_control"]
 
 
 @dataclass(frozen=True)
 class System:
-    """Everything on the device: model, evaluation point, chart, clocks and guards."""
+    """Everything on the device: model, state, chart, clocks and guards."""
 
     model: DeviceModel
     state: DeviceState
@@ -31,27 +28,11 @@ FIRST_STEP = 1.0e-8
 """First step under control after a start, when nothing is known of the motion yet [s]."""
 
 
-def build_step_control(accuracies: Sequence[float], device: Any) -> Any:
-    """The struct `StepControl` of every cell.
-
-    Args:
-        accuracies: node error per simulated time [um/ms]; 0 for a fixed step.
-    """
-    cells = len(accuracies)
-    c = StepControl()
-    c.tolerance = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
-    c.wanted_step, c.error_sum, c.error_time, c.refused_error = (
-        wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
-    )
-    c.rejected = wp.zeros(cells, dtype=wp.int32, device=device)
-    return c
-
-
 def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
     c.error_sum.zero_()
     c.error_time.zero_()
-    c.refused_error.zero_()
+    c.rejected_error.zero_()
     c.wanted_step.assign(np.where(c.tolerance.numpy() > 0.0, FIRST_STEP, fixed_start))
 
 

@@ -1,16 +1,18 @@
 """Clocks and switches of every cell on the device, so that a captured pass needs nothing from the host.
 
 Times, steps, faults and the loop condition lie in device arrays: every cell of a batch has its own clock and its own
-step, and stops alone when it is done or has lost its footing.
+step, and stops by itself when it is done or a guard has found a fault.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 NO_FAULT = 2**31 - 1
-# Of a step: what is closer to the target than this counts as reaching it.
+# Share of a step: what is closer to the target than this counts as reaching it, far above the round-off of a sum of
+# steps and far below what any observable resolves.
 STEP_TOLERANCE = 1.0e-6
 
 
@@ -26,13 +28,39 @@ class Control:
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
     at_rest: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
-    budget: wp.array(dtype=wp.int32)  # [1], passes left before the host looks again
+    budget: wp.array(dtype=wp.int32)  # [1], passes left before the host reads the clocks
     proceed: wp.array(dtype=wp.int32)  # [1], the loop condition
 
 
 @functools.cache
+def functions() -> SimpleNamespace:
+    """Device function `advanced`: the time at the end of a step, which is the target itself where that is close."""
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+
+    @wp.func(module=wp.get_module("warpflag_kernels.clock_functions"))
+    def advanced(control: Control, c: wp.int32):
+        """Time of cell c after its current step [s]."""
+        t = control.time[c] + control.step[c]
+        if control.target[c] - t < tolerance * control.step[c]:
+            return control.target[c]
+        return t
+
+    return SimpleNamespace(advanced=advanced)
+
+
+def allocate(cell_count: int, device: Any) -> Control:
+    """Clocks at time zero, no cell at work."""
+    c = Control()
+    c.time, c.target, c.longest_step, c.step = (wp.zeros(cell_count, dtype=wp.float64, device=device) for _ in range(4))
+    c.steps = wp.zeros(cell_count, dtype=wp.int32, device=device)
+    c.fault = wp.full(cell_count, NO_FAULT, dtype=wp.int32, device=device)
+    c.unfinished, c.at_rest, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4))
+    return c
+
+
+@functools.cache
 def _kernels() -> SimpleNamespace:
-    module = wp.get_module("warpflag_kernels.control")
+    module = wp.get_module("warpflag_kernels.clock")
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module)
@@ -47,6 +75,6 @@ def _kernels() -> SimpleNamespace:
     return SimpleNamespace(count_pass=count_pass)
 
 
-def count_pass(control: Control, device: object) -> None:
+def count_pass(control: Control, device: Any) -> None:
     """Counts one pass of the captured loop and decides whether another follows."""
     wp.launch(_kernels().count_pass, 1, inputs=[control], device=device)

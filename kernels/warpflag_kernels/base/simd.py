@@ -1,11 +1,10 @@
-"""Flagella of a cell side by side, one per lane of a vector register: how a CPU takes what goes row after row.
+"""SIMD over flagella: recursions along a chain, for several flagella of a cell in the lanes of a vector register.
 
-Along one flagellum every row waits for the one before; the same rows of several flagella do not wait for each other. A
-group is what fills a register: flagella of one cell. A lane that is left over repeats the last flagellum of its group,
-and so finds the same; what a lane finds beyond the end of its flagellum is not to be kept.
+Along one flagellum every row of a recursion depends on the one before; the same rows of several flagella are
+independent. A group is as many flagella of one cell as fill a register. A lane without a flagellum of its own repeats
+the last one of its group, with the same result; what a lane computes beyond the end of its flagellum is not stored.
 
-Clang's vector types are what makes vector code of this, hence C++. A strict build takes flagella one by one, as a GPU
-does.
+Clang's vector types express this, hence C++. A strict build takes flagella one by one, as a GPU does.
 """
 
 import functools
@@ -16,7 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.native import native
+from warpflag_kernels.base.precision import Precision
 
 REGISTER = 64  # bytes of the widest vector register
 
@@ -40,11 +40,13 @@ def struct() -> Any:
 
 
 def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, device: Any) -> Any:
-    """Groups of a batch.
+    """The struct `Groups` of a batch.
 
     Args:
+        p: precision, which sets the number of lanes.
         first_flagellum: first flagellum of every cell and their number, shape [cell_count + 1].
         first_node: first node of every flagellum and their number, shape [flagellum_count + 1].
+        device: Warp's device.
     """
     widest, length = REGISTER // wp.types.type_size_in_bytes(p.real), np.diff(first_node)
     first_group, start, groups = [0], [0], []
@@ -62,41 +64,18 @@ def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, dev
     return found
 
 
-# For group g: BODY with V, a vector of the W lanes, each with the first node and the last row of its flagellum. Nothing
-# of this is for CUDA, but a kernel that could call it must compile there.
-_GROUP = """
-#ifndef __CUDACC__
-    using R = REAL;
-    const int rows = groups.rows.data[g];
-    auto run = [&](auto zero) {
-        using V = decltype(zero);
-        constexpr int W = sizeof(V) / sizeof(R);
-        int flagellum[W], node[W], last[W], shortest = rows;
-        for (int l = 0; l < W; ++l) {
-            flagellum[l] = groups.first.data[g] + (l < groups.count.data[g] ? l : groups.count.data[g] - 1);
-            node[l] = first_node.data[flagellum[l]];
-            last[l] = first_node.data[flagellum[l] + 1] - node[l] - 1;
-            shortest = last[l] + 1 < shortest ? last[l] + 1 : shortest;
-        }
-        auto element = [&](int l, int i) { return node[l] + (i < last[l] ? i : last[l]); };
-        BODY
-    };
-    switch (groups.width.data[g]) { CASES }
-#endif
-"""
-
-
-def code(p: Precision, body: str, words: dict[str, str] | None = None) -> str:
-    """C++ of a function with arguments `groups`, `g` and `first_node`; words: what stands for what in the body.
+def code(p: Precision, body: str) -> str:
+    """C++ of a function with arguments `groups`, `g` and `first_node`, which does `body` for group g.
 
     Loops over r, c, m (rows, columns and more of small blocks) and l (lanes) are unrolled: else the blocks that they
     index would lie in memory.
+
+    Args:
+        p: precision of the lanes.
+        body: C++ in which V is a vector of W lanes.
     """
-    case = "case {0}: {{ typedef R V __attribute__((ext_vector_type({0}))); run(V(R(0))); break; }}"
+    case = "case {0}: {{ typedef Real V __attribute__((ext_vector_type({0}))); run(V(Real(0))); break; }}"
     widest = REGISTER // wp.types.type_size_in_bytes(p.real)
     cases = " ".join(case.format(1 << i) for i in range(widest.bit_length()))
-    name = {"float64": "double", "float32": "float"}[p.name]
-    text = _GROUP.replace("BODY", body)
-    for word, value in {**(words or {}), "CASES": cases, "REAL": name}.items():
-        text = text.replace(word, value)
+    text = native(__file__, "simd_group", p, BODY=body, CASES=cases)
     return re.sub(r"for \(int [rcml] ", r'_Pragma("clang loop unroll(full)") \g<0>', text)

@@ -1,4 +1,4 @@
-"""Precision, module options and the structs of device arrays that every kernel shares.
+"""Structs of device arrays that every kernel shares: the model of a batch, a pose, the state being evaluated.
 
 Elements are stored flagellum after flagellum, cell after cell. Element i of a flagellum is the pair (node r_i,
 segment i): segment i >= 1 ends at r_i, segment 0 is the motor tripod whose tangent is the motor axis m. So nodes and
@@ -15,121 +15,111 @@ from typing import Any
 
 import warp as wp
 
-# Vector code for this machine's CPU. Reassociation lets sums vectorise; NaN and infinity keep their meaning, because
-# the guards need them.
-FAST_CPU_FLAGS = (
-    "-march=native -mreassociate -fno-signed-zeros -freciprocal-math -ffp-contract=fast "
-    "-mprefer-vector-width=512 -mllvm=-inline-threshold=9000"
-)
-STRICT_CPU_FLAGS = "-march=native -ffp-contract=off"
-
-
-@dataclass(frozen=True)
-class Precision:
-    """One floating-point type and the build that uses it.
-
-    Attributes:
-        name: "float64" or "float32".
-        strict: build without reassociation, contraction or reciprocals (reproducible to the last bit).
-    """
-
-    name: str
-    strict: bool = False
-
-    @property
-    def real(self) -> Any:
-        return {"float64": wp.float64, "float32": wp.float32}[self.name]
-
-    @property
-    def vec3(self) -> Any:
-        return {"float64": wp.vec3d, "float32": wp.vec3f}[self.name]
-
-    @property
-    def vec4(self) -> Any:
-        return {"float64": wp.vec4d, "float32": wp.vec4f}[self.name]
-
-    @property
-    def quat(self) -> Any:
-        return {"float64": wp.quatd, "float32": wp.quatf}[self.name]
-
-    @property
-    def mat33(self) -> Any:
-        return {"float64": wp.mat33d, "float32": wp.mat33f}[self.name]
-
-    @property
-    def cpu_flags(self) -> str:
-        return STRICT_CPU_FLAGS if self.strict else FAST_CPU_FLAGS
-
-    def module(self, stage: str, variant: str = "") -> Any:
-        """Warp module of one stage in this precision; a variant is a set of switches compiled in."""
-        parts = ["warpflag_kernels", stage, self.name, "strict" if self.strict else "fast", variant]
-        module = wp.get_module(".".join(part for part in parts if part))
-        module.options.update({"enable_backward": False, "cpu_compiler_flags": self.cpu_flags, "fast_math": False})
-        return module
+from warpflag_kernels.base.plan import Plan, Switches
+from warpflag_kernels.base.precision import Precision
 
 
 @functools.cache
 def structs(p: Precision) -> SimpleNamespace:
-    """The structs `Model` (constant during a run), `State` (the current evaluation point and its forces), `PairSum`,
-    `Neighbours`.
+    """The structs `Model`, constant during a run, `Pose`, and `State`, one evaluation of the right-hand side.
 
     C cells, K flagella, E elements. An array that the scene does not need stays empty.
     """
     real, vec3 = p.real, p.vec3
 
     @wp.struct
-    class Model:
-        # Topology.
-        cell_of: wp.array(dtype=wp.int32)  # [E]
-        flagellum_of: wp.array(dtype=wp.int32)  # [E]
-        first_node: wp.array(dtype=wp.int32)  # [K + 1]
-        first_flagellum: wp.array(dtype=wp.int32)  # [C + 1]
-        # Rod, per flagellum [K].
+    class Rod:
+        """Per flagellum [K]."""
+
         segment_length: wp.array(dtype=real)  # h [um]
         bending_rigidity: wp.array(dtype=real)  # A [pN um^2]
         twist_rigidity: wp.array(dtype=real)  # C [pN um^2]
         hook_rigidity: wp.array(dtype=real)  # twist rigidity of the motor joint [pN um^2]
         stretching_stiffness: wp.array(dtype=real)  # K [pN]
         rest_strain: wp.array(dtype=vec3)  # h Omega^0 [rad]
-        # Motor and anchor, per flagellum [K]; vectors in body axes.
-        motor_torque: wp.array(dtype=real)  # [pN um]
-        motor_axis: wp.array(dtype=vec3)
-        anchor: wp.array(dtype=vec3)  # [um]
-        # Local drag.
-        mobility_along: wp.array(dtype=real)  # [E], along the tangent [um/(s pN)]
-        mobility_across: wp.array(dtype=real)  # [E] [um/(s pN)]
-        spin_mobility: wp.array(dtype=real)  # [K] [1/(pN um s)]
-        # Pair sum, per cell [C].
-        pair_radius: wp.array(dtype=real)  # [um]
-        pair_mobility: wp.array(dtype=real)  # 1/(8 pi eta) [um^2/(s pN)]
-        # Steric, per cell [C].
-        steric_strength: wp.array(dtype=real)  # F_0 [pN]
-        steric_diameter: wp.array(dtype=real)  # sigma [um]
-        # Body, per cell [C]: capsule surface, mobility of the spheroid along and across its axis.
-        body_half_length: wp.array(dtype=real)  # of the capsule's axis [um]
-        body_radius: wp.array(dtype=real)  # [um]
-        body_mobility_along: wp.array(dtype=real)  # [um/(s pN)]
-        body_mobility_across: wp.array(dtype=real)
-        body_spin_mobility: wp.array(dtype=real)  # about the axis [1/(pN um s)]
-        body_tumble_mobility: wp.array(dtype=real)  # across the axis [1/(pN um s)]
 
     @wp.struct
-    class State:
-        # Where: the current evaluation point.
+    class Motor:
+        """Per flagellum [K]; vectors in body axes."""
+
+        torque: wp.array(dtype=real)  # T_m [pN um]
+        axis: wp.array(dtype=vec3)  # m
+        anchor: wp.array(dtype=vec3)  # r_0 [um]
+
+    @wp.struct
+    class Drag:
+        """Local mobility."""
+
+        mobility_along: wp.array(dtype=real)  # [E], of a node along the tangent [um/(s pN)]
+        mobility_across: wp.array(dtype=real)  # [E] [um/(s pN)]
+        spin_mobility: wp.array(dtype=real)  # [K], of a segment about its tangent [1/(pN um s)]
+
+    @wp.struct
+    class Pairs:
+        """Rotne-Prager sum, per cell [C]."""
+
+        radius: wp.array(dtype=real)  # a [um]
+        mobility: wp.array(dtype=real)  # 1/(8 pi eta) [um^2/(s pN)]
+
+    @wp.struct
+    class Steric:
+        """Per cell [C]."""
+
+        strength: wp.array(dtype=real)  # F_0 [pN]
+        diameter: wp.array(dtype=real)  # sigma [um]
+
+    @wp.struct
+    class Body:
+        """Per cell [C]: the capsule that contact sees, and the mobility of the spheroid."""
+
+        half_length: wp.array(dtype=real)  # of the capsule's axis [um]
+        radius: wp.array(dtype=real)  # [um]
+        mobility_along: wp.array(dtype=real)  # along its axis [um/(s pN)]
+        mobility_across: wp.array(dtype=real)
+        spin_mobility: wp.array(dtype=real)  # about its axis [1/(pN um s)]
+        tumble_mobility: wp.array(dtype=real)  # about an axis across it [1/(pN um s)]
+
+    @wp.struct
+    class External:
+        """Forces from outside, in lab axes, per cell [C]."""
+
+        force_per_length: wp.array(dtype=vec3)  # on every flagellum [pN/um]
+        body_force: wp.array(dtype=vec3)  # at the body's centre [pN]
+
+    @wp.struct
+    class Model:
+        cell_of: wp.array(dtype=wp.int32)  # [E]
+        flagellum_of: wp.array(dtype=wp.int32)  # [E]
+        first_node: wp.array(dtype=wp.int32)  # [K + 1]
+        first_flagellum: wp.array(dtype=wp.int32)  # [C + 1]
+        rod: Rod
+        motor: Motor
+        drag: Drag
+        pairs: Pairs
+        steric: Steric
+        body: Body
+        external: External
+
+    @wp.struct
+    class Pose:
         position: wp.array(dtype=vec3)  # [E], node relative to the body centre, lab axes [um]
-        tangent: wp.array(dtype=vec3)  # [E], e3 of the segment
+        tangent: wp.array(dtype=vec3)  # [E], e3 of the segment; of the tripod: the motor axis
         director: wp.array(dtype=vec3)  # [E], e1 of the segment
         length: wp.array(dtype=real)  # [E], of the segment [um]
         body_position: wp.array(dtype=wp.vec3d)  # [C] [um]
         body_orientation: wp.array(dtype=wp.quatd)  # [C], body axes to lab axes
         body_axis: wp.array(dtype=vec3)  # [C], e_b3, points to the rear
-        # Which cells take part in this pass.
-        active: wp.array(dtype=wp.int32)  # [C]
+
+    @wp.struct
+    class State:
+        pose: Pose
+        active: wp.array(dtype=wp.int32)  # [C], 1: the cell takes part in this pass
         # Joint i couples segments i and i + 1: energy gradients with respect to the two segment vectors and spins.
         joint_before: wp.array(dtype=vec3)  # [E] [pN]
         joint_after: wp.array(dtype=vec3)  # [E] [pN]
         joint_spin_before: wp.array(dtype=real)  # [E] [pN um]
         joint_spin_after: wp.array(dtype=real)  # [E] [pN um]
+        stretch_change: wp.array(dtype=vec3)  # [E], first variation of the segment's stretching gradient [pN]
         # Steric forces of a segment, on its first and on its second node; contact of a node with the body.
         steric_first: wp.array(dtype=vec3)  # [E] [pN]
         steric_second: wp.array(dtype=vec3)  # [E] [pN]
@@ -143,101 +133,88 @@ def structs(p: Precision) -> SimpleNamespace:
         body_velocity: wp.array(dtype=vec3)  # [C] [um/s]
         body_spin: wp.array(dtype=vec3)  # [C] [rad/s]
 
-    @wp.struct
-    class PairSum:
-        # One array per component: what lets a compiler fill its vector registers. [E] each.
-        x: wp.array(dtype=real)  # position [um]
-        y: wp.array(dtype=real)
-        z: wp.array(dtype=real)
-        fx: wp.array(dtype=real)  # force, zero on r_0, which the sum leaves to the body [pN]
-        fy: wp.array(dtype=real)
-        fz: wp.array(dtype=real)
-        ux: wp.array(dtype=real)  # 8 pi eta times the velocity [pN/um]; only where pairs are summed by halves
-        uy: wp.array(dtype=real)
-        uz: wp.array(dtype=real)
-        # What float64 runs add up of it; only where their pairs are float32 and summed by halves.
-        total_x: wp.array(dtype=wp.float64)
-        total_y: wp.array(dtype=wp.float64)
-        total_z: wp.array(dtype=wp.float64)
-
-    @wp.struct
-    class Neighbours:
-        position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
-        left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
-        # When that was last asked; [E + BLOCK] midpoints of segments and half their lengths, a tenth added.
-        x: wp.array(dtype=wp.float32)  # [um]
-        y: wp.array(dtype=wp.float32)
-        z: wp.array(dtype=wp.float32)
-        half: wp.array(dtype=wp.float32)
-        extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
-        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists no longer hold
-        count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
-        earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
-        segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
-
-    return SimpleNamespace(Model=Model, State=State, PairSum=PairSum, Neighbours=Neighbours)
-
-
-@dataclass(frozen=True)
-class Switches:
-    """The terms a scene asks for. What is off is not compiled, allocated or launched.
-
-    Attributes:
-        pairs: which nodes the pair sum couples: "none", "within" one flagellum, "between" flagella, or "all".
-        steric: contact between segments of different flagella.
-        body_contact: contact between nodes and the body surface.
-        bearing_torque: the hook hands its bearing torque to the body, so the swimmer is torque-free.
-        short_pairs: every pair of the sum in float32, their sums in float64; in a float64 run.
-    """
-
-    pairs: str
-    steric: bool
-    body_contact: bool
-    bearing_torque: bool
-    short_pairs: bool
+    return SimpleNamespace(Model=Model, Pose=Pose, State=State)
 
 
 @dataclass(frozen=True)
 class DeviceModel:
-    """Model on a device.
+    """Model of a batch on a device.
 
     Attributes:
-        data: the struct `Model` of this precision.
-        groups: the struct `Groups`: flagella that a CPU takes side by side.
+        plan: how its kernels are executed.
+        switches: which of them there are.
+        terms: force terms in their order, instances of `Term`.
         cell_count, flagellum_count, element_count: sizes C, K, E.
-        largest_cell: moving nodes of the largest cell.
+        data: the struct `Model`.
+        groups: the struct `Groups`: flagella side by side in vector lanes.
     """
 
-    precision: Precision
+    plan: Plan
     switches: Switches
-    device: Any
+    terms: tuple[Any, ...]
     cell_count: int
     flagellum_count: int
     element_count: int
-    largest_cell: int
     data: Any
     groups: Any
 
     @property
-    def pair_precision(self) -> Precision:
-        """Of the terms of the pair sum."""
-        return Precision("float32", self.precision.strict) if self.switches.short_pairs else self.precision
+    def precision(self) -> Precision:
+        return self.plan.precision
 
     @property
-    def one_thread_per_cell(self) -> bool:
-        """Whether a launch is cut by cells: on a CPU, where its threads take turns. The strict build is cut finer."""
-        return self.device.is_cpu and not self.precision.strict
+    def device(self) -> Any:
+        return self.plan.device
 
     @property
-    def threads_cooperate(self) -> bool:
-        """Whether several threads work together on one node or one cell: on a GPU."""
-        return self.device.is_cuda
+    def touching(self) -> bool:
+        """Whether anything can be in contact."""
+        return any(term.contact for term in self.terms)
 
 
 @dataclass(frozen=True)
 class DeviceState:
-    """State on a device: the structs `State` and `Neighbours` of this precision, `PairSum` of that of the pairs."""
+    """State of a batch on a device.
+
+    Attributes:
+        data: the struct `State`.
+        pairs: the struct `PairSum` of the Rotne-Prager sum.
+        neighbours: the struct `Neighbours` of the steric force.
+    """
 
     data: Any
     pairs: Any
     neighbours: Any
+
+
+def allocate_pose(p: Precision, cell_count: int, element_count: int, device: Any, pose: Any) -> None:
+    """Arrays of the struct `Pose`, in place; segments have unit length, the rest is zero."""
+    for name in ("position", "tangent", "director"):
+        setattr(pose, name, wp.zeros(element_count, dtype=p.vec3, device=device))
+    pose.length = wp.ones(element_count, dtype=p.real, device=device)
+    pose.body_position = wp.zeros(cell_count, dtype=wp.vec3d, device=device)
+    pose.body_orientation = wp.zeros(cell_count, dtype=wp.quatd, device=device)
+    pose.body_axis = wp.zeros(cell_count, dtype=p.vec3, device=device)
+
+
+def allocate_state(model: DeviceModel) -> Any:
+    """Arrays of the struct `State`, zero; a term that is off gets none."""
+    p, device = model.precision, model.device
+    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    s = structs(p).State()
+    allocate_pose(p, cells, elements, device, s.pose)
+    s.active = zeros(cells, wp.int32)
+    s.joint_before, s.joint_after = zeros(elements, p.vec3), zeros(elements, p.vec3)
+    s.joint_spin_before, s.joint_spin_after = zeros(elements, p.real), zeros(elements, p.real)
+    if model.switches.has("steric"):
+        s.steric_first, s.steric_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
+    if model.switches.has("body contact"):
+        s.body_contact = zeros(elements, p.vec3)
+    s.force, s.velocity, s.spin_torque = zeros(elements, p.vec3), zeros(elements, p.vec3), zeros(elements, p.real)
+    s.flagellum_force, s.flagellum_torque = zeros(flagella, p.vec3), zeros(flagella, p.vec3)
+    s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
+    return s

@@ -1,8 +1,8 @@
-"""Contacts of an implicit step: the list of pairs that may touch, and the levers through which their forces act.
+"""Contacts of an implicit step: the list of pairs that may touch, and products with their contact Jacobian B.
 
-A contact that closes inside a step has no stiffness before it, so linearising its force across the step would let it
-pass. The step instead treats the gaps of all pairs that may close as unknowns and solves the force law exactly in
-their space; `contact_search` finds them.
+A contact that closes during a step has no stiffness at its beginning, so a force linearised there would let the
+filaments pass through each other. The step instead takes the gaps of all pairs that may close as unknowns and solves
+the exact force law for them. `search` fills the list.
 """
 
 import functools
@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import chain_chart
 
-PER_NODE = 4  # contacts that a cell has room for (eight bundled flagella have three)
+PER_NODE = 4  # contacts per node that a cell has room for; eight bundled flagella have three
 
 
 @functools.cache
@@ -27,7 +28,7 @@ def struct(p: Precision) -> Any:
     class Contacts:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
-        position: wp.array(dtype=vec3)  # [E], of the nodes where contacts were looked for [um]
+        position: wp.array(dtype=vec3)  # [E], of the nodes at the last search [um]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
         found: wp.array(dtype=wp.uint64)  # [E], which neighbours of a segment are contacts, a bit each
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
@@ -48,7 +49,7 @@ def struct(p: Precision) -> Any:
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of B: what forces at the contacts act on, and how an increment changes a gap."""
+    """Device functions of the contact Jacobian: loads of contact forces on nodes and body, changes of a gap."""
     real, vec3, vec6 = p.real, p.vec3, chain_chart.types(p).vec6
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
     Increment = chain_chart.types(p).Increment
@@ -67,17 +68,18 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def shift_with_body(x: Increment, c: wp.int32, y: vec3):
-        """How an increment moves a point y of the body."""
+        """Displacement of a point y of the body under an increment [um]."""
         b = x.body[c]
         return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), y)
 
     @wp.func(module=module)
     def gap_change(model: Model, state: State, contacts_in: Contacts, i: wp.int32, x: Increment):
-        """B^T x of contact i: how an increment changes its gap."""
+        """B^T x of contact i: the change of its gap under an increment [um]."""
         e = contacts_in.segment[i]
         j = contacts_in.other[i]
         if j < 0:
-            return wp.dot(contacts_in.normal[i], shift(x, e) - shift_with_body(x, model.cell_of[e], state.position[e]))
+            beside = shift_with_body(x, model.cell_of[e], state.pose.position[e])
+            return wp.dot(contacts_in.normal[i], shift(x, e) - beside)
         s = contacts_in.at[i]
         r = contacts_in.at_other[i]
         own = s * shift(x, e)
@@ -87,11 +89,11 @@ def functions(p: Precision) -> SimpleNamespace:
             own += (real(1.0) - s) * shift(x, e - 1)
             other += (real(1.0) - r) * shift(x, j - 1)
         else:
-            first = shift_with_body(x, model.cell_of[e], state.position[e - 1])
+            first = shift_with_body(x, model.cell_of[e], state.pose.position[e - 1])
             if anchored == 2:
                 first = shift(x, e - 1)
             own += (real(1.0) - s) * first
-            first = shift_with_body(x, model.cell_of[e], state.position[j - 1])
+            first = shift_with_body(x, model.cell_of[e], state.pose.position[j - 1])
             if anchored == 1:
                 first = shift(x, j - 1)
             other += (real(1.0) - r) * first
@@ -145,11 +147,11 @@ def functions(p: Precision) -> SimpleNamespace:
     def body_load(
         model: Model, state: State, contacts_in: Contacts, magnitude: wp.array(dtype=real), k: wp.int32, on_anchor: vec3
     ):
-        """What the contact forces of a flagellum put on the body: through its anchor, and as reactions."""
-        load = on_body(on_anchor, state.position[model.first_node[k]])
+        """Force and torque of a flagellum's contacts on the body: through its anchor, and as reactions."""
+        load = on_body(on_anchor, state.pose.position[model.first_node[k]])
         i = contacts_in.body_head[k]
         while i >= 0:
-            load -= on_body(magnitude[i] * contacts_in.normal[i], state.position[contacts_in.segment[i]])
+            load -= on_body(magnitude[i] * contacts_in.normal[i], state.pose.position[contacts_in.segment[i]])
             i = contacts_in.next[i]
         return load
 
@@ -220,7 +222,7 @@ def _kernels(p: Precision, body: bool) -> SimpleNamespace:
 
 
 def allocate(model: DeviceModel, touching: bool) -> Any:
-    """Arrays of the struct `Contacts`; next to none where nothing can touch."""
+    """Arrays of the struct `Contacts`; room for one contact a cell where nothing can touch."""
     p, device = model.precision, model.device
     nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
     first = np.concatenate([[0], np.cumsum(PER_NODE * nodes if touching else np.ones_like(nodes))])
@@ -245,10 +247,10 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:
     """Adds forces of these magnitudes at the listed contacts [pN] to `force`; `body_contact` is set."""
     kernels, inputs = (
-        _kernels(model.precision, model.switches.body_contact),
+        _kernels(model.precision, model.switches.has("body contact")),
         [model.data, contacts, magnitude, state.data],
     )
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.act_on_cells, model.cell_count, inputs=inputs, device=model.device)
     else:
         wp.launch(kernels.act, model.element_count, inputs=inputs, device=model.device)

@@ -1,68 +1,83 @@
-"""Near segments of other flagella: a list per segment that holds until something has moved by half its skin.
+"""Verlet lists: for every segment, the near segments of other flagella, valid until a node has moved by half the skin.
 
-Contact, its search for a step and the guard against crossings all ask which segments are close. A list that is a
-skin longer than the reach answers for many passes: it is built anew only when some node of the cell has moved by more
-than half the skin since. A segment in a crowd larger than its list asks all segments instead; either way the answer
-is the same, in the same order.
+The steric force, the contact search of a step and the guard against crossings all need to know which segments are
+close. A list with a reach longer by the skin serves many passes: it is rebuilt only when some node of the cell has
+moved by more than half the skin since. A segment with more neighbours than its list has room for tests all segments
+instead; either way the result is the same, in the same order.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.native import native
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
-CONTACT_REACH = 1.5  # of contacts, the cutoff and what a step's search adds [sigma]
-SKIN = 0.1  # [um]
-SLOTS = 64  # segments that a list holds
-SLACK = 1.1  # over a flagellum's longest segment: while lists hold, none stretches further
-BLOCK = 16  # segments that a CPU asks at once
+CONTACT_REACH = (
+    1.5  # reach of the lists without the skin [sigma]: the cutoff 1.122 plus the search's margin, rounded up
+)
+SKIN = 0.1  # [um]; at 6 mm/s, the fastest tips, a list serves 8 us
+SLOTS = 64  # room of a list, and bits of the mask in which a search marks its contacts
+SLACK = 1.1  # a segment is at most this times the longest one at the last check: twice the strain that guards allow
+BLOCK = 16  # segments that a CPU tests at once: one vector of float32
 
-# Segments [begin, end) of one flagellum that are near (x, y, z), listed in ascending order; returns how many the list
-# then names. A CPU asks a block of them at once: a bit for each that is near. What a block reads beyond `end` is
-# masked, and lies within the arrays, which are a block longer than there are segments.
-_LIST = """
-    const float* __restrict__ X = near.x.data; const float* __restrict__ Y = near.y.data;
-    const float* __restrict__ Z = near.z.data; const float* __restrict__ H = near.half.data;
-    int* S = near.segment.data + list;
-    #ifdef __CUDACC__
-    for (int j = begin; j < end; ++j) {
-        const float dx = x - X[j], dy = y - Y[j], dz = z - Z[j], reach = within + H[j];
-        if (dx * dx + dy * dy + dz * dz < reach * reach) {
-            if (found < SLOTS) S[found] = j;
-            ++found;
-        }
-    }
-    #else
-    for (int b = begin; b < end; b += BLOCK) {
-        unsigned hits = 0;
-        for (int l = 0; l < BLOCK; ++l) {
-            const float dx = x - X[b + l], dy = y - Y[b + l], dz = z - Z[b + l], reach = within + H[b + l];
-            hits |= (unsigned)(dx * dx + dy * dy + dz * dz < reach * reach) << l;
-        }
-        if (end - b < BLOCK) hits &= (1u << (end - b)) - 1u;
-        for (; hits; hits &= hits - 1) {
-            if (found < SLOTS) S[found] = b + __builtin_ctz(hits);
-            ++found;
-        }
-    }
-    #endif
-    return found;
-""".replace("SLOTS", str(SLOTS)).replace("BLOCK", str(BLOCK))
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Neighbours`: a list of near segments for every segment, and where things were when it was built."""
+    real, vec3 = p.real, p.vec3
+
+    @wp.struct
+    class Neighbours:
+        position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
+        left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
+        # At the last such test, [E + BLOCK]: midpoints of segments, and 0.55 times their lengths.
+        x: wp.array(dtype=wp.float32)  # [um]
+        y: wp.array(dtype=wp.float32)
+        z: wp.array(dtype=wp.float32)
+        half: wp.array(dtype=wp.float32)
+        extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
+        stale: wp.array(dtype=wp.int32)  # [C], 1: the lists are no longer valid
+        count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
+        earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
+        segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
+
+    return Neighbours
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Neighbours`, with lists that are not valid yet; none without steric forces."""
+    p, near, device = model.precision, struct(model.precision)(), model.device
+    if not model.switches.has("steric"):
+        return near
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    elements, flagella = model.element_count, model.flagellum_count
+    near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
+    near.left, near.stale = zeros(flagella, wp.int32), zeros(model.cell_count, wp.int32)
+    near.x, near.y, near.z, near.half = (zeros(elements + BLOCK, wp.float32) for _ in range(4))
+    near.extent = zeros(flagella, p.real)
+    near.count, near.earlier = zeros(elements, wp.int32), zeros(elements, wp.int32)
+    near.segment = zeros(elements * SLOTS, wp.int32)
+    return near
 
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
     """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
     real, vec3 = p.real, p.vec3
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     slots, slack = wp.constant(SLOTS), wp.constant(real(SLACK))
     module = p.module("neighbours_functions")
 
     @wp.func(module=module)
     def candidates(model: Model, near: Neighbours, e: wp.int32):
-        """How many segments are to be looked at for segment e."""
+        """Number of segments to be tested against segment e."""
         n = near.count[e]
         if n < 0:
             c = model.cell_of[e]
@@ -89,7 +104,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def middle(state: State, e: wp.int32):
-        return real(0.5) * (state.position[e - 1] + state.position[e])
+        return real(0.5) * (state.pose.position[e - 1] + state.pose.position[e])
 
     @wp.func(module=module)
     def next_near(longest: real, j: wp.int32, distance: real, reach: real):
@@ -129,18 +144,17 @@ def functions(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def lists(p: Precision) -> SimpleNamespace:
-    """Device functions: whether the lists of a flagellum no longer hold, the list of one segment, all of a cell."""
+    """Device functions: whether the lists of a flagellum are outdated, the list of one segment, all of a cell."""
     real = p.real
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     middle = functions(p).middle
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
-    # Lengths hardly change; what they do is in the skin, like what the nodes move. So is what float32 leaves of a
-    # place.
+    # Half a length with a tenth added, for the stretch while lists are valid and for positions rounded to float32.
     half_share = wp.constant(real(0.55))
     module = p.module("neighbours_functions")
 
-    @wp.func_native(_LIST)
+    @wp.func_native(native(__file__, "near_segments", p, SLOTS=SLOTS, BLOCK=BLOCK))
     def list_some(
         near: Neighbours,
         list: wp.int32,
@@ -155,20 +169,20 @@ def lists(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def has_left(model: Model, state: State, near: Neighbours, k: wp.int32):
-        """1: a node of flagellum k has moved by more than half the skin; else 0. Also notes where its segments are."""
+        """1: a node of flagellum k has moved by more than half the skin; else 0. Also stores midpoints of segments."""
         left = int(0)
         begin = model.first_node[k]
         end = model.first_node[k + 1]
-        centre = state.position[(begin + end) / 2]
+        centre = state.pose.position[(begin + end) / 2]
         widest = real(0.0)
         e = begin
         while e < end:
-            d = state.position[e] - near.position[e]
+            d = state.pose.position[e] - near.position[e]
             if not (real(4.0) * wp.dot(d, d) < skin * skin):  # true for NaN
                 left = 1
             if e > begin:
                 x = middle(state, e)
-                half = half_share * state.length[e]
+                half = half_share * state.pose.length[e]
                 near.x[e] = wp.float32(x[0])
                 near.y[e] = wp.float32(x[1])
                 near.z[e] = wp.float32(x[2])
@@ -182,11 +196,11 @@ def lists(p: Precision) -> SimpleNamespace:
     def list_near(model: Model, state: State, near: Neighbours, e: wp.int32, c: wp.int32):
         """The list of segment e of cell c."""
         own = model.flagellum_of[e]
-        near.position[e] = state.position[e]
+        near.position[e] = state.pose.position[e]
         found = int(0)
         if e > model.first_node[own]:
             x = middle(state, e)
-            within = contact_reach * model.steric_diameter[c] + real(0.5) * state.length[e] + skin
+            within = contact_reach * model.steric.diameter[c] + real(0.5) * state.pose.length[e] + skin
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
                 if k == own:
@@ -194,7 +208,7 @@ def lists(p: Precision) -> SimpleNamespace:
                 else:
                     begin = model.first_node[k]
                     end = model.first_node[k + 1]
-                    away = x - state.position[(begin + end) / 2]
+                    away = x - state.pose.position[(begin + end) / 2]
                     reach = within + near.extent[k]
                     if wp.dot(away, away) < reach * reach:
                         found = list_some(
@@ -206,7 +220,7 @@ def lists(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def refresh_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
-        """All lists of cell c, if one of them no longer holds."""
+        """Rebuilds all lists of cell c, if one of them is no longer valid."""
         stale = int(0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -225,7 +239,7 @@ def lists(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
-    Model, State, Neighbours = structs(p).Model, structs(p).State, structs(p).Neighbours
+    Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     has_left, list_near, refresh_cell = lists(p).has_left, lists(p).list_near, lists(p).refresh_cell
     module = p.module("neighbours")
 
@@ -285,10 +299,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def refresh(model: DeviceModel, state: DeviceState) -> None:
-    """Lists that hold at the current positions: builds anew those of cells in which a node has moved too far."""
+    """Makes the lists valid at the current positions: rebuilds those of cells in which a node has moved too far."""
     kernels, near, device = _kernels(model.precision), state.neighbours, model.device
     inputs = [model.data, state.data, near]
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.refresh_cells, model.cell_count, inputs=inputs, device=device)
         return
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)

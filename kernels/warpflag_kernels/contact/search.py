@@ -1,8 +1,8 @@
-"""The search for contacts: which pairs may touch in a step, where, and along which direction.
+"""The search for contacts: which pairs may touch in a step, their closest points and their normals.
 
 Pairs within the cutoff plus a margin, flagellum against flagellum and node against body, go into one list per cell:
-counted per segment, summed, filled, and chained for the segments of the other side; no atomics, the same order every
-time.
+counted per segment, summed up, filled in, and linked for the segments of the other side; no atomics, the same order
+every time.
 """
 
 import functools
@@ -11,20 +11,22 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, steric
-from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.contact.constants import CUTOFF
 
-MARGIN = 0.3  # beyond the cutoff, for what the predicted pose is wrong by [sigma]
-REACH = steric.CUTOFF + MARGIN  # of what is listed [sigma]
+MARGIN = 0.3  # added to the cutoff for the error of the predicted pose [sigma]
+REACH = CUTOFF + MARGIN  # largest gap of a listed pair [sigma]
 
 
 @functools.cache
 def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
-    Model, State, Contacts, Pose = structs(p).Model, structs(p).State, contact_list.struct(p), chain_chart.types(p).Pose
-    Neighbours = structs(p).Neighbours
-    nearest, direction = steric.functions(p).nearest, steric.functions(p).direction
+    Model, State, Pose, Contacts = structs(p).Model, structs(p).State, structs(p).Pose, contact_list.struct(p)
+    Neighbours = neighbours.struct(p)
+    law = steric.functions(p)
+    nearest, direction, off_axis = law.nearest, law.direction, law.off_axis
     near_by = neighbours.functions(p)
     candidates, candidate, first_later, beside = (
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
@@ -34,29 +36,23 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
     module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
 
     @wp.func(module=module)
-    def meets_at(
+    def set_pair(
         model: Model, pose: Pose, listed: Contacts, i: wp.int32, e: wp.int32, j: wp.int32,
         at: real, at_other: real, apart: vec3, r: real,
     ):  # fmt: skip
-        """Where and how segments e and j are in contact i, r apart."""
+        """Parameters, gap and normal of contact i, of segments e and j at the distance r."""
         listed.at[i] = at
         listed.at_other[i] = at_other
         listed.gap[i] = r
         along = pose.position[e] - pose.position[e - 1]
         other = pose.position[j] - pose.position[j - 1]
-        listed.normal[i] = direction(apart, r, along, other, model.steric_diameter[model.cell_of[e]])
+        listed.normal[i] = direction(apart, r, along, other, model.steric.diameter[model.cell_of[e]])
 
     @wp.func(module=module)
-    def off_axis(model: Model, pose: Pose, e: wp.int32, c: wp.int32):
-        """From the nearest point of the body's axis to node e."""
-        axis, half = pose.body_axis[c], model.body_half_length[c]
-        return pose.position[e] - wp.clamp(wp.dot(pose.position[e], axis), -half, half) * axis
-
-    @wp.func(module=module)
-    def stands_off(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
-        """How a node is in contact i with the body, so far away from its axis."""
+    def set_node(model: Model, listed: Contacts, i: wp.int32, away: vec3, c: wp.int32):
+        """Gap and normal of contact i, of a node with the body; away: from the body's axis to the node."""
         distance = wp.length(away)
-        listed.gap[i] = distance - model.body_radius[c]
+        listed.gap[i] = distance - model.body.radius[c]
         listed.normal[i] = away / distance
 
     @wp.func(module=module)
@@ -70,12 +66,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         room: wp.int32,
         asked: wp.uint64,
     ):
-        """Contacts that belong to element e, with segments of later flagella and with the body, recorded from `start`
-        as far as there is room; how many there are, and a bit for each candidate that is one. Of a list's candidates
-        those `asked` are looked at, of a longer one's all."""
+        """Lists the contacts of element e with segments of later flagella and with the body, from `start` on.
+
+        Returns how many there are, listed only if there is room, and a bit for each candidate that is one. Of at most
+        64 candidates those whose bit is set in `asked` are tested, of more candidates all.
+        """
         k = model.flagellum_of[e]
         c = model.cell_of[e]
-        reach = reach_factor * model.steric_diameter[c]
+        reach = reach_factor * model.steric.diameter[c]
         found = int(0)
         seen = wp.uint64(0)
         q1 = pose.position[e]
@@ -104,7 +102,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                                 i = start + found
                                 listed.segment[i] = e
                                 listed.other[i] = j
-                                meets_at(model, pose, listed, i, e, j, at, at_other, apart, r)
+                                set_pair(model, pose, listed, i, e, j, at, at_other, apart, r)
                                 anchored = wp.where(e - 1 == model.first_node[k], 1, 0)
                                 first = model.first_node[model.flagellum_of[j]]
                                 listed.anchored[i] = anchored + wp.where(j - 1 == first, 2, 0)
@@ -114,14 +112,14 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
                 bit = bit << wp.uint64(1)
         if wp.static(body):
             away = off_axis(model, pose, e, c)
-            if wp.length(away) - model.body_radius[c] < reach:
+            if wp.length(away) - model.body.radius[c] < reach:
                 if found < room:
                     i = start + found
                     listed.segment[i] = e
                     listed.other[i] = -1
                     listed.at[i] = real(1.0)
                     listed.at_other[i] = real(0.0)
-                    stands_off(model, listed, i, away, c)
+                    set_node(model, listed, i, away, c)
                 found += 1
         return found, seen
 
@@ -237,7 +235,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         # Out:
         listed: Contacts,
     ):
-        """All of that for a cell at once, for a CPU: every pair is looked at once."""
+        """The list of a whole cell by one thread, for a CPU: every pair is tested once."""
         c = wp.tid()
         if state.active[c] == 0:
             return
@@ -293,11 +291,11 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         while i < listed.stop[e]:
             j = listed.other[i]
             if j < 0:
-                stands_off(model, listed, i, off_axis(model, pose, e, c), c)
+                set_node(model, listed, i, off_axis(model, pose, e, c), c)
             else:
                 p1, p2 = pose.position[e - 1], pose.position[j - 1]
                 at, at_other, apart = nearest(p1, pose.position[e], p2, pose.position[j])
-                meets_at(model, pose, listed, i, e, j, at, at_other, apart, wp.length(apart))
+                set_pair(model, pose, listed, i, e, j, at, at_other, apart, wp.length(apart))
             i += 1
 
     return SimpleNamespace(count=count, sum_up=sum_up, fill=fill, link=link, list_cells=list_cells, renew=renew)
@@ -307,13 +305,15 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
     """Lists every pair of a pose that is in contact or may come into contact within a step.
 
     Args:
-        pose: the one that `state` holds.
+        model, state: of the batch.
+        pose: the pose of `state`.
+        contacts_out: struct `Contacts`.
     """
-    if model.switches.steric:
+    if model.switches.has("steric"):
         neighbours.refresh(model, state)
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs, device = [model.data, state.data, pose, state.neighbours, contacts_out], model.device
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.list_cells, model.cell_count, inputs=inputs, device=device)
         return
     wp.launch(kernels.count, model.element_count, inputs=inputs, device=device)
@@ -323,7 +323,7 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
 
 
 def renew(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
-    """Gaps, directions and levers of the listed contacts in a pose."""
-    kernels = _kernels(model.precision, model.switches.steric, model.switches.body_contact)
+    """Closest points, gaps and normals of the listed contacts in another pose; arguments as in `find`."""
+    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs = [model.data, state.data, pose, contacts_out]
     wp.launch(kernels.renew, model.element_count, inputs=inputs, device=model.device)

@@ -1,8 +1,7 @@
 """The cell body: sums what the flagella hand to it and moves by the mobility of a prolate spheroid.
 
-Each flagellum hands over the force at its anchor, the reaction -T_m m of the motor, the bearing torque -m x dE/de_0
-of the universal joint (the part of the joint's torque across m, which the paper's form leaves out), and the reaction
-to the contact of its nodes with the body surface.
+Each flagellum hands over the force at its anchor, with its torque about the body's centre, and what the terms put on
+the body directly: the motor's reaction, the bearing torque, the reaction to the contact of its nodes with the surface.
 """
 
 import functools
@@ -10,31 +9,43 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
 
 @functools.cache
-def functions(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNamespace:
+def mobility(p: Precision) -> SimpleNamespace:
+    """Device function `respond`: velocity and angular velocity of a body under a force and a torque."""
+    vec3, Model, State = p.vec3, structs(p).Model, structs(p).State
+
+    @wp.func(module=p.module("body_mobility"))
+    def respond(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
+        """Velocity [um/s] and angular velocity [rad/s] of the body of cell c; torque about its centre."""
+        axis = state.pose.body_axis[c]
+        force_along = wp.dot(axis, force) * axis
+        torque_along = wp.dot(axis, torque) * axis
+        velocity = model.body.mobility_along[c] * force_along + model.body.mobility_across[c] * (force - force_along)
+        spin = model.body.spin_mobility[c] * torque_along + model.body.tumble_mobility[c] * (torque - torque_along)
+        return velocity, spin
+
+    return SimpleNamespace(respond=respond)
+
+
+@functools.cache
+def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     """Device functions: what one flagellum hands to the body, and the motion of one body."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    module = p.module("body_functions", _variant(body_contact, bearing_torque))
+    on_body, respond = combined(p, terms).on_body, mobility(p).respond
+    module = p.module("body_functions", variant(terms))
 
     @wp.func(module=module)
     def sum_flagellum(model: Model, state: State, k: wp.int32):
         first = model.first_node[k]
-        m = state.tangent[first]
-        force = state.force[first]
-        torque = wp.cross(state.position[first], force) - model.motor_torque[k] * m
-        if wp.static(bearing_torque):
-            torque -= wp.cross(m, state.joint_before[first])
-        if wp.static(body_contact):
-            e = first + 1
-            while e < model.first_node[k + 1]:
-                reaction = -state.body_contact[e]
-                force += reaction
-                torque += wp.cross(state.position[e], reaction)
-                e += 1
+        through_anchor = state.force[first]
+        arm = state.pose.position[first]
+        force, torque = on_body(model, state, k, through_anchor, wp.cross(arm, through_anchor))
         state.flagellum_force[k] = force
         state.flagellum_torque[k] = torque
 
@@ -47,31 +58,25 @@ def functions(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleN
             force += state.flagellum_force[k]
             torque += state.flagellum_torque[k]
             k += 1
-        axis = state.body_axis[c]
-        force_along = wp.dot(axis, force) * axis
-        torque_along = wp.dot(axis, torque) * axis
-        state.body_velocity[c] = model.body_mobility_along[c] * force_along + model.body_mobility_across[c] * (
-            force - force_along
-        )
-        state.body_spin[c] = model.body_spin_mobility[c] * torque_along + model.body_tumble_mobility[c] * (
-            torque - torque_along
-        )
+        velocity, spin = respond(model, state, c, force, torque)
+        state.body_velocity[c] = velocity
+        state.body_spin[c] = spin
 
     return SimpleNamespace(sum_flagellum=sum_flagellum, move=move)
 
 
 @functools.cache
-def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNamespace:
+def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
-    f = functions(p, body_contact, bearing_torque)
+    f = functions(p, terms)
     sum_flagellum, move = f.sum_flagellum, f.move
-    module = p.module("body", _variant(body_contact, bearing_torque))
+    module = p.module("body", variant(terms))
 
     @wp.kernel(module=module)
     def sum_flagella(
         # Model:
         model: Model,
-        # State:
+        # Out:
         state: State,
     ):
         k = wp.tid()
@@ -82,7 +87,7 @@ def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNa
     def move_all(
         # Model:
         model: Model,
-        # State:
+        # Out:
         state: State,
     ):
         c = wp.tid()
@@ -92,19 +97,19 @@ def _kernels(p: Precision, body_contact: bool, bearing_torque: bool) -> SimpleNa
     return SimpleNamespace(sum_flagella=sum_flagella, move=move_all)
 
 
-def _variant(body_contact: bool, bearing_torque: bool) -> str:
-    return ("_contact" if body_contact else "") + ("_bearing" if bearing_torque else "")
+def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
+    """Force [pN] and torque about the body's centre [pN um] that every flagellum hands to its body, of these terms."""
+    kernel = _kernels(model.precision, terms).sum_flagella
+    wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
+
+
+def move_bodies(model: DeviceModel, state: DeviceState) -> None:
+    """Velocity and angular velocity of every body from `flagellum_force` and `flagellum_torque`."""
+    kernel = _kernels(model.precision, model.terms).move
+    wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
 def body_motion(model: DeviceModel, state: DeviceState) -> None:
     """Velocity [um/s] and angular velocity [rad/s] of every body, into `body_velocity` and `body_spin`."""
-    kernels = _kernels(model.precision, model.switches.body_contact, model.switches.bearing_torque)
-    inputs = [model.data, state.data]
-    wp.launch(kernels.sum_flagella, model.flagellum_count, inputs=inputs, device=model.device)
+    sum_flagella(model, state, model.terms)
     move_bodies(model, state)
-
-
-def move_bodies(model: DeviceModel, state: DeviceState) -> None:
-    """The same from the sums of every flagellum, `flagellum_force` and `flagellum_torque`."""
-    kernels = _kernels(model.precision, model.switches.body_contact, model.switches.bearing_torque)
-    wp.launch(kernels.move, model.cell_count, inputs=[model.data, state.data], device=model.device)

@@ -1,4 +1,4 @@
-"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum of `pair_sum`.
+"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum.
 
 Local (the paper's mu_t): [t t/gamma_par + (I - t t)/gamma_perp]/h per node (h/2 at the free end), t the normalised
 sum of the adjacent tangents, at the last node the last segment's.
@@ -9,7 +9,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.plan import WARP
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import rotne_prager
 
 
@@ -21,14 +23,14 @@ def local(p: Precision) -> SimpleNamespace:
     @wp.func(module=p.module("mobility_local"))
     def drag_velocity(model: Model, state: State, e: wp.int32, k: wp.int32):
         """Velocity of node e of flagellum k, not r_0, that its own force causes [um/s]."""
-        t = state.tangent[e]
+        t = state.pose.tangent[e]
         square = p.real(1.0)
         if e + 1 < model.first_node[k + 1]:
-            t += state.tangent[e + 1]
+            t += state.pose.tangent[e + 1]
             square = wp.dot(t, t)
         force = state.force[e]
         along = (wp.dot(t, force) / square) * t
-        return model.mobility_along[e] * along + model.mobility_across[e] * (force - along)
+        return model.drag.mobility_along[e] * along + model.drag.mobility_across[e] * (force - along)
 
     return SimpleNamespace(drag_velocity=drag_velocity)
 
@@ -36,7 +38,7 @@ def local(p: Precision) -> SimpleNamespace:
 @functools.cache
 def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
     """Device functions: velocities of one node, and of all nodes of a cell."""
-    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
+    Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
     module = p.module("mobility_functions", _variant(p, pair, pairs, form))
     sums = rotne_prager.functions(p, pair, pairs, form)
     add_cell, flow_at = sums.add_cell, sums.flow_at
@@ -44,21 +46,21 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
     drag_velocity = local(p).drag_velocity
 
     @wp.func(module=module)
-    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, lane: wp.int32):
-        """Velocity of node e of flagellum k of cell c; the lanes of a warp share its pairs."""
+    def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, thread: wp.int32):
+        """Velocity of node e of flagellum k of cell c; the threads of a warp share its pairs."""
         if e == model.first_node[k]:
-            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.position[e])
+            state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.pose.position[e])
             return
         v = drag_velocity(model, state, e, k)
         if wp.static(pairs != "none"):
-            v += model.pair_mobility[c] * flow_at(model, s, e, k, c, lane)
-        if lane == 0:
+            v += model.pairs.mobility[c] * flow_at(model, s, e, k, c, thread)
+        if thread == 0:
             state.velocity[e] = v
 
     @wp.func(module=module)
     def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
         """Velocities of all nodes of cell c."""
-        if wp.static(form == "halves"):
+        if wp.static(form == "symmetric"):
             add_cell(model, state, s, c)
         e = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
@@ -72,7 +74,7 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
 @functools.cache
 def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
     vec3, real = p.vec3, pair.real
-    Model, State, PairSum = structs(p).Model, structs(p).State, structs(pair).PairSum
+    Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
     f = functions(p, pair, pairs, form)
     move_node, move_cell = f.move_node, f.move_cell
     module = p.module("mobility", _variant(p, pair, pairs, form))
@@ -87,7 +89,7 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
         s: PairSum,
     ):
         e = wp.tid()
-        x = state.position[e]
+        x = state.pose.position[e]
         force = state.force[e]
         if e == model.first_node[model.flagellum_of[e]]:
             force = vec3(p.real(0.0))
@@ -103,22 +105,23 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
         # Model:
         model: Model,
         # State:
-        state: State,
         s: PairSum,
+        # Out:
+        state: State,
     ):
-        e, lane = wp.tid()
+        e, thread = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0:
-            move_node(model, state, s, e, model.flagellum_of[e], c, lane)
+            move_node(model, state, s, e, model.flagellum_of[e], c, thread)
 
     kernels = SimpleNamespace(pack=pack, velocities=velocities)
-    if form == "halves":  # elsewhere it need not be compiled
+    if form == "symmetric":  # elsewhere it need not be compiled
 
         @wp.kernel(module=module)
         def by_cells(
             # Model:
             model: Model,
-            # State:
+            # Out:
             state: State,
             s: PairSum,
         ):
@@ -134,29 +137,17 @@ def _variant(p: Precision, pair: Precision, pairs: str, form: str) -> str:
     return "_".join([pairs, form, *["short"] * (pair != p)])
 
 
-def form_of(model: DeviceModel) -> str:
-    """How the pair sum is done, see `pair_sum.functions`."""
-    if model.switches.pairs == "none":
-        return "thread"
-    if model.one_thread_per_cell:
-        return "halves"
-    return "warp" if model.threads_cooperate else "thread"
-
-
-def sums_by_halves(model: DeviceModel) -> bool:
-    """Whether a thread sums a whole cell and takes every pair once for both of its nodes."""
-    return form_of(model) == "halves"
-
-
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion."""
-    form = form_of(model)
-    kernels, device = _kernels(model.precision, model.pair_precision, model.switches.pairs, form), model.device
+    plan, device = model.plan, model.device
+    kernels = _kernels(model.precision, plan.pair_precision, model.switches.pairs, plan.pair_sum)
     inputs = [model.data, state.data, state.pairs]
-    if form == "halves":
+    if plan.pair_sum == "symmetric":
         wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)
         return
-    if model.switches.pairs != "none":
+    if plan.pair_sum != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
-    lanes = rotne_prager.WARP if form == "warp" else 1
-    wp.launch(kernels.velocities, (model.element_count, lanes), inputs=inputs, device=device)
+    threads = plan.gathering_threads
+    block = WARP if threads > 1 and device.is_cpu else 256  # on a CPU the threads of a block are fibers that meet
+    inputs = [model.data, state.pairs, state.data]
+    wp.launch(kernels.velocities, (model.element_count, threads), inputs=inputs, device=device, block_dim=block)

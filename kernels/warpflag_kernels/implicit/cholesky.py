@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.precision import Precision
 
 
 @functools.cache

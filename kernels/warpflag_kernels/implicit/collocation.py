@@ -1,21 +1,24 @@
 """Linearly implicit stepping of second order: collocation of a quadratic path, solved in two iterations.
 
-The path leads through the last two states and the next one, and obeys the equations of motion at the time theta dt of
-the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it passes there at theta w delta + e, so
+The path leads through the last two states and the next one, and obeys the equations of motion at the collocation point,
+the time theta dt of the step. With delta the last increment, w = dt/dt_last and mu = w/(1 + w), it passes there at
+theta w delta + e, so
 
     e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
 
-and the whole step is w delta + e/rho. The error goes as 3 theta^2 - 1, and stiff modes are damped for any theta above
-2^-1/2, but ring for a while below 1. So a step whose end is looked at from outside takes theta = 1, which is BDF2 and
-leaves them where they belong. Both iterations evaluate V once, at the pose known so far, and solve for what is missing:
+and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
+theta above 2^-1/2, but alternate in sign for some steps below 1. So a step that ends at an output time takes theta = 1,
+which is BDF2: recorded forces and energies are then those of an equilibrated state. Both iterations evaluate V once, at
+the pose known so far, and solve for what is missing:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
-in the chain chart. The matrix holds the local mobility D in place of M, over-weighted by `over_implicit`, which keeps
-the explicit flows of the pair sum stable; the second iteration squares what that leaves, and finds V, contacts and
-levers where the first one led. V holds the forces F_x that the contacts are thought to have, and those that count, F,
-obey the exact law. Every step is checked before it is taken: solves, guards and the error estimate. A step that fails
-is taken again, shorter.
+in the chain chart, F the contact forces, B the contact Jacobian, F_x the contact forces that V was evaluated with. The
+matrix holds the local mobility D in place of M, and s = g times the over-implicitness in place of g, which keeps the
+explicit flows of the pair sum stable. The second iteration squares the relative error that this leaves, and evaluates
+V, contacts and Jacobian anew where the first one led. F obeys the exact steric law at the gaps that the step leads to.
+Every step is checked before it is taken: solves, guards and the error estimate. A step that fails is taken again,
+shorter.
 """
 
 import functools
@@ -24,8 +27,10 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, Control
-from warpflag_kernels.base.types import Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, structs
 from warpflag_kernels.contact import contact_list
 from warpflag_kernels.implicit import block_band, contact_solve, delassus
 from warpflag_kernels.rod import chain_chart
@@ -35,17 +40,20 @@ from warpflag_kernels.stepping import step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
-THETA = 0.8  # where in a step the equations hold, unless its end is looked at from outside
-# Error that counts over the mean of what the predictions of a cell's nodes miss, for theta = 1. The mean is what is
-# followed: contacts that open, close or pass a vertex make single nodes jump, which does not add up.
-PEAK = 7.0
-GAP_SHARE = 0.35  # of the error that a step may make, for what the contact law leaves over
-GAP_GROWTH = 4.0e9  # so much over dt^3 may be left in any case: what a step leaves over grows like that [um/s^3]
+# Collocation point of a step that does not end at an output time, as a fraction of the step. The truncation error
+# falls with it as 3 theta^2 - 1; below 0.8 the stiff stretch of K x 100 gave indefinite matrices (docs/numerics.md).
+THETA = 0.8
+# Largest node error of a step over the mean predictor error of the cell's nodes, for theta = 1. The mean is controlled,
+# since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
+ERROR_PER_PREDICTOR = 7.0
+GAP_SHARE = 0.35  # residual of the gaps that the contact solve may leave, over the error that a step may make
+# A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
+GAP_GROWTH = 4.0e9
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Implicit`: the clockwork of every cell, per cell [C] unless said otherwise."""
+    """The struct `Implicit`: step history and coefficients of the current step, per cell [C] unless said otherwise."""
     real = p.real
 
     @wp.struct
@@ -53,21 +61,38 @@ def struct(p: Precision) -> Any:
         over_implicit: wp.array(dtype=wp.float64)
         last_step: wp.array(dtype=wp.float64)  # [s]
         step_before: wp.array(dtype=wp.float64)  # [s]
-        history: wp.array(dtype=wp.int32)  # increments known: 0, 1, 2
+        history: wp.array(dtype=wp.int32)  # how many earlier increments there are: 0, 1, 2
         ratio: wp.array(dtype=wp.float64)  # w
-        theta: wp.array(dtype=wp.float64)  # where in the step the equations hold
-        ahead: wp.array(dtype=wp.float64)  # theta w
+        theta: wp.array(dtype=wp.float64)  # collocation point as a fraction of the step
+        ahead: wp.array(dtype=wp.float64)  # theta w, scale of the extrapolation by the last increment
         reach: wp.array(dtype=wp.float64)  # rho
-        curved: wp.array(dtype=wp.float64)  # share in e of how the last increment differs from the one before
+        curvature: wp.array(dtype=wp.float64)  # factor of the second difference of earlier increments in predicted e
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
-        one: wp.array(dtype=wp.float64)  # 1, the scale of a plain retraction
-        missed: wp.array(dtype=real)  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
-        predicted: wp.array(dtype=real)  # [K], lengths of the displacements predicted for it, their sum [um]
-        trust: wp.array(dtype=wp.float64)  # share of a prediction that counts
+        one: wp.array(dtype=wp.float64)  # 1, the scale of a retraction by a whole increment
+        predictor_error: wp.array(
+            dtype=real
+        )  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
+        predicted_displacement: wp.array(dtype=real)  # [K], lengths of what was predicted for them, summed up [um]
+        trust: wp.array(dtype=wp.float64)  # 1 less the predictor error of the last step over its prediction, at least 0
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
 
     return Implicit
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Implicit`, zero but for `one`."""
+    p, device = model.precision, model.device
+    i = struct(p)()
+    floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "reach")
+    for name in (*floats, "curvature", "trust"):
+        setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
+    for name in ("history", "accepted", "evaluations"):
+        setattr(i, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
+    for name in ("predictor_error", "predicted_displacement"):
+        setattr(i, name, wp.zeros(model.flagellum_count, dtype=p.real, device=device))
+    i.one = wp.ones(model.cell_count, dtype=wp.float64, device=device)
+    return i
 
 
 @functools.cache
@@ -77,12 +102,13 @@ def kernels(p: Precision) -> SimpleNamespace:
     Chart, Implicit = chart_stage.struct(p), struct(p)
     Band, Contacts = block_band.types(p).Band, contact_list.struct(p)
     Law = delassus.struct(p)
-    _Pose, Increment, vec6 = chain_chart.types(p).Pose, chain_chart.types(p).Increment, chain_chart.types(p).vec6
+    Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     drag = block_band.functions(p).drag
     f = step_control.functions(p, independent=True)
     allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
-    module = p.module("implicit")
-    inside, peak = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(PEAK))
+    advanced = clock.functions().advanced
+    module = p.module("collocation")
+    theta_inside, per_predictor = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(ERROR_PER_PREDICTOR))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
@@ -93,9 +119,9 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
         # Out:
+        control: Control,
         imp: Implicit,
         band: Band,
         contacts_out: Contacts,
@@ -110,7 +136,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = wp.float64(0.0)
         if imp.history[c] > 0:
             w = dt / imp.last_step[c]
-        theta = inside
+        theta = theta_inside
         if dt >= left:
             theta = one
         mu = w / (one + w)
@@ -121,17 +147,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.theta[c] = theta
         imp.ahead[c] = theta * w
         imp.reach[c] = rho
-        imp.curved[c] = wp.float64(0.0)
+        imp.curvature[c] = wp.float64(0.0)
         imp.ratio_before[c] = wp.float64(0.0)
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
-            imp.curved[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
+            imp.curvature[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
         law.gain[c] = g
         law.failed[c] = 0
-        finest_gap = wp.float64(model.steric_diameter[c]) * finest
+        finest_gap = wp.float64(model.steric.diameter[c]) * finest
         enough = wp.max(gap_share * allowed(steps, c, dt), gap_growth * dt * dt * dt)
         law.tolerance[c] = real(wp.max(finest_gap, enough))
         contacts_out.overflow[c] = 0
@@ -149,12 +175,12 @@ def kernels(p: Precision) -> SimpleNamespace:
         # Out:
         predicted: Increment,
     ):
-        """What e is on a path that is quadratic in time, as the last two increments say."""
+        """The predictor: e of the quadratic path through the last three states."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
             return
-        scale = real(imp.curved[c])
+        scale = real(imp.curvature[c])
         ratio = real(imp.ratio_before[c])
         predicted.node[e] = scale * (last.node[e] - ratio * before.node[e])
         if e == model.first_node[model.first_flagellum[c]]:
@@ -182,18 +208,18 @@ def kernels(p: Precision) -> SimpleNamespace:
         gain = real(law.gain[c])
         inv_dt = real(wp.float64(1.0) / band.step[c])
         slope = gain * real(imp.ratio[c] / band.step[c])
-        gone = slope * last.node[e] + inv_dt * found.node[e]
-        spin = gain * model.spin_mobility[k] * state.spin_torque[e] - gone[3]
+        known = slope * last.node[e] + inv_dt * found.node[e]
+        spin = gain * model.drag.spin_mobility[k] * state.spin_torque[e] - known[3]
         v = vec3(real(0.0))
         if e > model.first_node[k]:
-            v = gain * state.velocity[e] - vec3(gone[0], gone[1], gone[2])
+            v = gain * state.velocity[e] - vec3(known[0], known[1], known[2])
             v = drag(band, e, v)
         elif k == model.first_flagellum[c]:
             u = state.body_velocity[c]
             w = state.body_spin[c]
             rate = gain * vec6(u[0], u[1], u[2], w[0], w[1], w[2])
             x.body[c] = rate - slope * last.body[c] - inv_dt * found.body[c]
-        x.node[e] = vec4(v[0], v[1], v[2], spin / model.spin_mobility[k])
+        x.node[e] = vec4(v[0], v[1], v[2], spin / model.drag.spin_mobility[k])
 
     @wp.kernel(module=module)
     def complete(
@@ -201,17 +227,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        imp: Implicit,
         last: Increment,
         found: Increment,
         predicted: Increment,
         x: Increment,
         # Out:
+        imp: Implicit,
         total: Increment,
-        rest: Increment,
+        remaining: Increment,
         chart: Chart,
     ):
-        """The whole step, what of it is left to go, and the error estimates of a flagellum."""
+        """The whole step, what remains of it from the present pose, and the predictor error of a flagellum."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
@@ -220,8 +246,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         w = real(imp.ratio[c])
         ahead = real(imp.ahead[c])
         whole = real(wp.float64(1.0) / imp.reach[c])
-        missed = real(0.0)
-        foreseen = real(0.0)
+        predictor_error = real(0.0)
+        predicted_displacement = real(0.0)
         e = first
         while e < model.first_node[k + 1]:
             f = found.node[e] + x.node[e]
@@ -229,21 +255,21 @@ def kernels(p: Precision) -> SimpleNamespace:
             d = f - p  # third divided difference of the path
             t = w * last.node[e] + whole * f
             total.node[e] = t
-            rest.node[e] = t - ahead * last.node[e] - found.node[e]
+            remaining.node[e] = t - ahead * last.node[e] - found.node[e]
             if e > first:
-                missed += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-                foreseen += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+                predictor_error += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+                predicted_displacement += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
             e += 1
         if imp.history[c] != 2:
-            missed = real(0.0)
-        imp.missed[k] = whole * missed
-        imp.predicted[k] = whole * foreseen
+            predictor_error = real(0.0)
+        imp.predictor_error[k] = whole * predictor_error
+        imp.predicted_displacement[k] = whole * predicted_displacement
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), total.node[first][3])
         if k == model.first_flagellum[c]:
             b = w * last.body[c] + whole * (found.body[c] + x.body[c])
             total.body[c] = b
-            rest.body[c] = b - ahead * last.body[c] - found.body[c]
-            chart.commit[c] = 1  # the guards look at this pose
+            remaining.body[c] = b - ahead * last.body[c] - found.body[c]
+            chart.commit[c] = 1  # the guards check this pose
             chart.body_increment[c] = vec6d(
                 wp.float64(b[0]),
                 wp.float64(b[1]),
@@ -272,33 +298,30 @@ def kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         dt = control.step[c]
-        missed = wp.float64(0.0)
+        predictor_error = wp.float64(0.0)
         k = model.first_flagellum[c]
-        foreseen = wp.float64(0.0)
+        predicted_displacement = wp.float64(0.0)
         nodes = int(0)
         while k < model.first_flagellum[c + 1]:
-            missed += wp.float64(imp.missed[k])
-            foreseen += wp.float64(imp.predicted[k])
+            predictor_error += wp.float64(imp.predictor_error[k])
+            predicted_displacement += wp.float64(imp.predicted_displacement[k])
             nodes += model.first_node[k + 1] - model.first_node[k] - 1
             k += 1
         theta = imp.theta[c]
         truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
-        error = peak * truncated * missed / wp.float64(nodes)
+        error = per_predictor * truncated * predictor_error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
             imp.accepted[c] = 1
             imp.trust[c] = wp.float64(0.0)
-            if missed < foreseen:
-                imp.trust[c] = wp.float64(1.0) - missed / foreseen
+            if predictor_error < predicted_displacement:
+                imp.trust[c] = wp.float64(1.0) - predictor_error / predicted_displacement
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)
             control.steps[c] += 1
-            t = control.time[c] + dt
-            if control.target[c] - t < wp.float64(1.0e-6) * dt:
-                t = control.target[c]
-            control.time[c] = t
+            control.time[c] = advanced(control, c)
             return
         imp.accepted[c] = 0
         chart.commit[c] = 0
@@ -330,11 +353,11 @@ def kernels(p: Precision) -> SimpleNamespace:
     @wp.kernel(module=module)
     def keep_bodies(
         # State:
-        state: State,
         next_last: Increment,
         next_before: Increment,
         imp: Implicit,
         # Out:
+        state: State,
         last: Increment,
         before: Increment,
         control: Control,

@@ -1,10 +1,14 @@
-"""How the contacts of a step answer to forces: products with the compliance W, without the matrix.
+"""The Delassus operator of a step's contacts: changes of the gaps per contact force, as products without the matrix.
 
-A load lambda on the contacts changes the increment by Y lambda and the gaps by W lambda = B^T Y lambda. B puts it on
-the nodes, the pair sum carries it on, the factorised system answers, and the gaps are read off.
+Contact forces lambda change the increment by Y lambda and the gaps by W lambda. With the contact Jacobian B
 
-One block of threads takes one cell: on CUDA its lanes share every loop and wait for each other between them, on a CPU
-a single lane does it all.
+    Y = P g M B,      W = B^T Y :
+
+B distributes contact forces to nodes and bodies, M is the mobility with the Rotne-Prager sum, P the inverse of the
+step's matrix.
+
+One block of threads takes one cell: on CUDA its threads share every loop and synchronise between them, on a CPU a
+single thread does it all.
 """
 
 import functools
@@ -13,64 +17,63 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, structs
 from warpflag_kernels.contact import contact_list
-from warpflag_kernels.implicit import block_band
-from warpflag_kernels.implicit import frozen_flow as flow_stage
+from warpflag_kernels.implicit import block_band, body_coupling
+from warpflag_kernels.implicit import step_flow as flow_stage
 from warpflag_kernels.rod import chain_chart
-
-LANES = 128  # threads of a block on CUDA
 
 
 @wp.func_native("WP_TILE_SYNC();")
 def meet():
-    """Lanes of a block wait for each other; what one has written the others read."""
+    """Threads of a block wait for each other; what one has written the others read."""
     ...
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Law`: unknowns, work space and settings."""
+    """The struct `ContactLaw`: unknowns, work space and settings."""
     real, vec3 = p.real, p.vec3
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
 
     @wp.struct
-    class Law:
+    class ContactLaw:
         # Per contact [capacity].
-        free_gap: wp.array(dtype=real)
-        solved_gap: wp.array(dtype=real)
-        residual: wp.array(dtype=real)
-        force: wp.array(dtype=real)  # what acts [pN]
-        load: wp.array(dtype=real)  # what W is applied to [pN]
-        applied: wp.array(dtype=real)  # all that it has been applied to in a solution [pN]
-        answered: wp.array(dtype=real)  # and what that has changed [um]
+        free_gap: wp.array(dtype=real)  # at the end of the step, if contact forces do not change [um]
+        solved_gap: wp.array(dtype=real)  # the unknown [um]
+        residual: wp.array(dtype=real)  # solved_gap - free_gap - W applied [um]
+        force: wp.array(dtype=real)  # contact force that velocities are evaluated with [pN]
+        load: wp.array(dtype=real)  # vector that the next product applies W to [pN]
+        applied: wp.array(dtype=real)  # sum of all vectors that W has been applied to in this solution [pN]
+        answered: wp.array(dtype=real)  # W applied [um]
         change: wp.array(dtype=real)  # W load [um]
-        yielding: wp.array(dtype=real)  # estimate of the contact's own compliance, a diagonal entry of W [um/pN]
-        share: wp.array(dtype=real)  # of a change of the gap, that its force takes back by `yielding` alone
-        wanted: wp.array(dtype=real)  # change of the gap, less what it yields to its own force [um]
-        # What is known of W, see `quasi_newton`: loads of unit length, and their answers beyond `yielding`.
+        diagonal: wp.array(dtype=real)  # diagonal compliance, an estimate of W's diagonal [um/pN]
+        share: wp.array(dtype=real)  # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact
+        wanted: wp.array(dtype=real)  # change of gap - d F(gap) that the linear model asks for [um]
+        # Secant pairs, see `quasi_newton`: orthonormal vectors, and W less the diagonal applied to them.
         loads: wp.array(dtype=real)  # [KEPT * capacity]
         answers: wp.array(dtype=real)  # [KEPT * capacity]
-        # Per element [E], flagellum [K], lane [C * LANES].
+        # Per element [E], flagellum [K], thread [C * threads of a block].
         on_first: wp.array(dtype=vec3)  # of segment i [pN]
         on_second: wp.array(dtype=vec3)
         on_node: wp.array(dtype=vec3)
         on_body: wp.array(dtype=vec6)  # [K]
         answer: Increment  # Y load
-        partial: wp.array(dtype=real)  # of sums and maxima
+        partial: wp.array(dtype=real)  # every thread's part of a sum or maximum
         # Per cell [C].
         gain: wp.array(dtype=wp.float64)  # g
         tolerance: wp.array(dtype=real)  # of a gap [um]
-        small: wp.array(dtype=real)  # [C * SMALL], the system of the shares of known loads
-        known: wp.array(dtype=wp.int32)  # how many of these there have been
+        small: wp.array(dtype=real)  # [C * SMALL], the linear system in the span of the secant pairs
+        known: wp.array(dtype=wp.int32)  # secant pairs found so far
         products: wp.array(dtype=wp.int32)  # with W, so far
-        failed: wp.array(dtype=wp.int32)  # 1: not solved
+        failed: wp.array(dtype=wp.int32)  # 1: the gaps were not found
 
-    return Law
+    return ContactLaw
 
 
 def allocate(model: DeviceModel, contacts_in: Any) -> Any:
-    """Arrays of the struct `Law`, for as many contacts as there is room for."""
+    """Arrays of the struct `ContactLaw`, for as many contacts as there is room for."""
     p, cells, elements, total = model.precision, model.cell_count, model.element_count, len(contacts_in.gap)
     vec6 = chain_chart.types(p).vec6
 
@@ -79,64 +82,72 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
 
     law = struct(p)()
     gaps, forces = ("free_gap", "solved_gap", "residual", "answered", "change"), ("force", "load", "applied")
-    for name in (*gaps, *forces, "yielding", "share"):
+    for name in (*gaps, *forces, "diagonal", "share"):
         setattr(law, name, zeros(total, p.real))
     law.on_node = zeros(elements, p.vec3)
-    if model.threads_cooperate:
+    if model.plan.contact_block > 1:
         law.on_first, law.on_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
     law.on_body = zeros(model.flagellum_count, vec6)
     law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)
-    law.partial = zeros(cells * LANES, p.real)
+    law.partial = zeros(cells * model.plan.contact_block, p.real)
     law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
     law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
     return law
 
 
 @functools.cache
-def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespace:
-    """Device functions of one block of so many lanes: sums and maxima over them, and the product."""
+def reductions(p: Precision, threads: int) -> SimpleNamespace:
+    """Device functions of one block of so many threads: sums and maxima over them."""
+    real, Law = p.real, struct(p)
+    module = p.module("block_reductions", str(threads))
+
+    @wp.func(module=module)
+    def block_sum(law: Law, value: real, c: wp.int32, thread: wp.int32):
+        if wp.static(threads == 1):
+            return value
+        law.partial[c * threads + thread] = value
+        meet()
+        total = real(0.0)
+        i = int(0)
+        while i < threads:
+            total += law.partial[c * threads + i]
+            i += 1
+        meet()
+        return total
+
+    @wp.func(module=module)
+    def block_max(law: Law, value: real, c: wp.int32, thread: wp.int32):
+        if wp.static(threads == 1):
+            return value
+        law.partial[c * threads + thread] = value
+        meet()
+        largest = real(0.0)
+        i = int(0)
+        while i < threads:
+            largest = wp.max(largest, law.partial[c * threads + i])
+            i += 1
+        meet()
+        return largest
+
+    return SimpleNamespace(block_sum=block_sum, block_max=block_max)
+
+
+@functools.cache
+def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) -> SimpleNamespace:
+    """Device functions of one block of so many threads: sums and maxima over them, and the product."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
     Flow, vec6 = flow_stage.struct(p), chain_chart.types(p).vec6
     flows = flow_stage.functions(p, pairs, form)
     load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
-    band_functions = block_band.functions(p)
-    body_mobility, solve_flagellum = band_functions.body_mobility, band_functions.solve_flagellum
-    drag, solve_cell, follow = band_functions.drag, band_functions.solve_cell, band_functions.follow
-    side_by_side = lanes == 1 and not p.strict
-    lever = contact_list.functions(p)
-    gap_change, body_load = lever.gap_change, lever.body_load
-    segment_loads, node_loads = lever.segment_loads, lever.node_loads
-    module = p.module("compliance", f"{pairs}_{form}_{lanes}")
-
-    @wp.func(module=module)
-    def block_sum(law: Law, value: real, c: wp.int32, lane: wp.int32):
-        if wp.static(lanes == 1):
-            return value
-        law.partial[c * lanes + lane] = value
-        meet()
-        total = real(0.0)
-        i = int(0)
-        while i < lanes:
-            total += law.partial[c * lanes + i]
-            i += 1
-        meet()
-        return total
-
-    @wp.func(module=module)
-    def block_max(law: Law, value: real, c: wp.int32, lane: wp.int32):
-        if wp.static(lanes == 1):
-            return value
-        law.partial[c * lanes + lane] = value
-        meet()
-        largest = real(0.0)
-        i = int(0)
-        while i < lanes:
-            largest = wp.max(largest, law.partial[c * lanes + i])
-            i += 1
-        meet()
-        return largest
+    band_functions, body_rate = block_band.functions(p), body_coupling.functions(p).body_rate
+    drag, solve_flagellum = band_functions.drag, band_functions.solve_flagellum
+    solve_cell, follow = band_functions.solve_cell, band_functions.follow
+    jacobian = contact_list.functions(p)
+    gap_change, body_load = jacobian.gap_change, jacobian.body_load
+    segment_loads, node_loads = jacobian.segment_loads, jacobian.node_loads
+    module = p.module("delassus", f"{pairs}_{form}_{chains}_{threads}")
 
     @wp.func(module=module)
     def product(
@@ -147,7 +158,7 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         flow: Flow,
         law: Law,
         c: wp.int32,
-        lane: wp.int32,
+        thread: wp.int32,
     ):
         """W load into `change`, Y load into `answer`."""
         meet()
@@ -155,8 +166,8 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
         k_end = model.first_flagellum[c + 1]
         begin = model.first_node[k_begin]
         end = model.first_node[k_end]
-        e = begin + lane
-        if wp.static(lanes == 1):
+        e = begin + thread
+        if wp.static(threads == 1):
             while e < end:
                 law.on_node[e] = vec3(real(0.0))
                 e += 1
@@ -166,26 +177,26 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
                 on_first, on_second = segment_loads(contacts_in, law.load, e)
                 law.on_first[e] = on_first
                 law.on_second[e] = on_second
-                e += lanes
+                e += threads
             meet()
-            e = begin + lane
+            e = begin + thread
             while e < end:
                 f = law.on_second[e]
                 if e + 1 < end:
                     f += law.on_first[e + 1]  # zero where the next element is a tripod
                 law.on_node[e] = f
-                e += lanes
+                e += threads
         if wp.static(pairs != "none"):
-            e = begin + lane
+            e = begin + thread
             while e < end:
-                if flow.place[e] >= 0:
-                    load(flow, flow.place[e], law.on_node[e])
-                e += lanes
+                if flow.slot[e] >= 0:
+                    load(flow, flow.slot[e], law.on_node[e])
+                e += threads
         meet()
         if wp.static(form != "gathered"):
             spread(model, flow, c, loaded_end(model, flow, c))
         gain = real(law.gain[c])
-        e = begin + lane
+        e = begin + thread
         while e < end:
             k = model.flagellum_of[e]
             f = vec3(real(0.0))
@@ -195,45 +206,43 @@ def functions(p: Precision, pairs: str, form: str, lanes: int) -> SimpleNamespac
                     f += drag(band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
                 f = gain * f
             law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
-            e += lanes
+            e += threads
         meet()
         weight = real(band.weight[c])
-        if wp.static(side_by_side):
+        if wp.static(chains == "simd"):
             solve_cell(model, band, c, law.answer)
-        k = k_begin + lane
+        k = k_begin + thread
         while k < k_end:
             first = model.first_node[k]
-            if wp.static(not side_by_side):
+            if wp.static(chains == "serial"):
                 solve_flagellum(model, band, k, law.answer)
             back = vec6(real(0.0))
             for j in range(3):
                 back += wp.transpose(band.from_body[3 * k + j]) * law.answer.node[first + j]
             on_body = body_load(model, state, contacts_in, law.load, k, law.on_node[first])
             law.on_body[k] = gain * on_body - weight * back
-            k += lanes
+            k += threads
         meet()
-        if lane == 0:
+        if thread == 0:
             total = vec6(real(0.0))
             k = k_begin
             while k < k_end:
                 total += law.on_body[k]
                 k += 1
-            force = vec3(total[0], total[1], total[2])
-            torque = vec3(total[3], total[4], total[5])
-            rate = body_mobility(model, state, c, force, torque)
+            rate = body_rate(model, state, c, total)
             law.answer.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
             law.products[c] += 1
         meet()
         body = law.answer.body[c]
-        e = begin + lane
+        e = begin + thread
         while e < end:
             law.answer.node[e] = follow(band, e, law.answer.node[e], body)
-            e += lanes
+            e += threads
         meet()
-        i = contacts_in.first[c] + lane
+        i = contacts_in.first[c] + thread
         stop = contacts_in.first[c] + contacts_in.count[c]
         while i < stop:
             law.change[i] = gap_change(model, state, contacts_in, i, law.answer)
-            i += lanes
+            i += threads
 
-    return SimpleNamespace(block_sum=block_sum, block_max=block_max, product=product)
+    return SimpleNamespace(product=product)

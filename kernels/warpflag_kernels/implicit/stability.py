@@ -1,28 +1,32 @@
-"""How strongly the flows outside the matrix act: the over-implicitness that keeps a step stable, measured.
+"""Stability of the two iterations of an implicit step: the over-implicitness that it needs, measured.
 
-The matrix of an implicit step holds the local mobility alone. With the full one, M, a stiff mode is kappa times as
-fast as the matrix takes it to be: side by side, filaments carry each other along. A step of two iterations leaves
-(1 - kappa/w)^2 of such a mode, w the over-implicitness, so w must exceed kappa/2. kappa is the largest eigenvalue of
-w P (1/dt + g M H), P the solution with the matrix; a power iteration follows it, one product every few steps, from a
-direction that the cell keeps.
+The matrix of a step holds the local mobility alone. Under the full mobility M a stiff mode relaxes kappa times as fast
+as with the local one, since filaments side by side drag each other along. With the stiffness weighted by the
+over-implicitness w, a step of two iterations multiplies such a mode by (1 - kappa/w)^2, so w must exceed kappa/2.
+kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
+product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
 """
 
 import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
-from warpflag_kernels.implicit import block_band, linearised
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.implicit import linear_system, linearised
 from warpflag_kernels.rod import chain_chart
 
-LEAST = 1.3  # over-implicitness at which one or two flagella are stable
-SHARE = 0.6  # of kappa that the over-implicitness takes
-FALL = 0.985  # of it from one look to the next at least: a power iteration comes from below
-MOST = 5.0  # beyond, two iterations leave too much of what is stiff
-FIRST_LOOKS = 30  # steps after a start that are all looked at
-INTERVAL = 4  # steps between two looks later
+LEAST = 1.3  # least over-implicitness, and that of one or two flagella, whose kappa is not measured
+OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
+# The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
+# approaches the eigenvalue from below.
+LARGEST_FALL = 0.985
+MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
+FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
+INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
 
 
 @functools.cache
@@ -33,13 +37,29 @@ def struct(p: Precision) -> Any:
     @wp.struct
     class Stability:
         kappa: wp.array(dtype=wp.float64)
-        look: wp.array(dtype=wp.int32)  # 1: this pass measures
-        active: wp.array(dtype=wp.int32)  # the state's own, while its cells are masked
-        due: wp.array(dtype=wp.int32)  # [1], 1: some cell measures in this pass
-        probe: Increment
-        size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part
+        measured: wp.array(dtype=wp.int32)  # 1: the cell is measured in this pass
+        active: wp.array(dtype=wp.int32)  # copy of `State.active`, which is masked during a measurement
+        due: wp.array(dtype=wp.int32)  # [1], 1: some cell is measured in this pass
+        probe: Increment  # of the power iteration, unit length
+        size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part of a product
 
     return Stability
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Stability`; the probe has a share of every mode: random, but the same in every run and
+    every cell."""
+    cells, device = model.cell_count, model.device
+    s = struct(model.precision)()
+    s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
+    s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
+    s.measured, s.active = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+    s.due = wp.ones(1, dtype=wp.int32, device=device)  # its kernels load in the first pass, which takes no step
+    nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+    probe = chain_chart.allocate(model)
+    probe.node.assign(np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes]))
+    s.probe = probe
+    return s
 
 
 @functools.cache
@@ -47,8 +67,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
     real = p.real
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability")
-    first_looks, interval = wp.constant(FIRST_LOOKS), wp.constant(INTERVAL)
-    least, most, share, fall = (wp.constant(wp.float64(x)) for x in (LEAST, MOST, SHARE, FALL))
+    first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
+    least, most, share, fall = (
+        wp.constant(wp.float64(x)) for x in (LEAST, MOST, OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL)
+    )
 
     @wp.kernel(module=module)
     def schedule(
@@ -63,13 +85,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         c = wp.tid()
         stability.active[c] = state.active[c]
-        look = int(0)
+        measured = int(0)
         crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-        due = steps[c] < first_looks or steps[c] % interval == 0 or accepted[c] == 0
+        due = steps[c] < first_measurements or steps[c] % interval == 0 or accepted[c] == 0
         if crowd and state.active[c] != 0 and due:
-            look = 1
+            measured = 1
             stability.due[0] = 1
-        stability.look[c] = look
+        stability.measured[c] = measured
 
     @wp.kernel(module=module)
     def mask(
@@ -79,7 +101,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
     ):
         c = wp.tid()
-        state.active[c] = stability.look[c]
+        state.active[c] = stability.measured[c]
 
     @wp.kernel(module=module)
     def measure(
@@ -92,9 +114,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         k = wp.tid()
         first = model.first_node[k]
-        if stability.look[model.cell_of[first]] == 0:
+        if stability.measured[model.cell_of[first]] == 0:
             return
-        scale = real(1.0) / model.segment_length[k]
+        scale = real(1.0) / model.rod.segment_length[k]
         total = wp.float64(0.0)
         e = first
         while e < model.first_node[k + 1]:
@@ -123,7 +145,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = wp.tid()
         state.active[c] = stability.active[c]
         stability.due[0] = 0
-        if stability.look[c] == 0:
+        if stability.measured[c] == 0:
             return
         total = wp.float64(0.0)
         k = model.first_flagellum[c]
@@ -145,11 +167,15 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
-    """Which cells measure in this pass, into `look` and `due`: those of three flagella or more, now and then, and
-    whenever a step has been refused.
+    """Which cells are measured in this pass, into `measured` and `due`.
+
+    Those are the cells of three flagella or more, every few steps, and whenever a step has been refused.
 
     Args:
-        steps, accepted: steps taken by every cell so far, and whether the last one counted, shape [cell_count].
+        model, state: of the batch.
+        steps: steps attempted by every cell so far, shape [cell_count].
+        accepted: 1: the last one was accepted, shape [cell_count].
+        stability: struct `Stability`.
     """
     inputs = [model.data, state.data, steps, accepted, stability]
     wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
@@ -166,7 +192,7 @@ def measure(
     stability: Any,
     over_implicit: Any,
 ) -> None:
-    """One power iteration of the cells that look, and their over-implicitness from it.
+    """One power iteration of the cells that are due, and their over-implicitness from it.
 
     Args:
         gain: g, shape [cell_count].
@@ -176,7 +202,7 @@ def measure(
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, flow, gain, stability.probe, answer)
-    block_band.solve(model, state, band, answer)
+    linear_system.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, answer, stability, over_implicit, state.data]

@@ -1,9 +1,9 @@
 """Chain chart of implicit stepping: increments applied as a rotation and a stretch of every segment in turn.
 
 An increment x of the nodes and phi of the spins turns segment i by Om = (t x dx)/l + phi t and stretches it by
-t.dx/l, dx the difference of its nodes' increments; the segments are chained again from the anchor. A node that turns
-by an angle about its neighbour so gets no false strain of half the angle squared, which in the plain chart loads the
-stiff stretch. `carry` moves other increments along into the tangent space of the new state.
+t.dx/l, dx the difference of its nodes' increments; the segments are chained again from the anchor. So a node that
+turns by an angle about its neighbour gets no spurious strain of half the angle squared, which with plain displacements
+would load the stiff stretch. Vector transport takes other increments along into the tangent space of the new pose.
 """
 
 import functools
@@ -13,45 +13,44 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels.base import simd
-from warpflag_kernels.base.types import DeviceModel, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import chain_chart_simd, rotations
 
 
 @functools.cache
 def types(p: Precision) -> SimpleNamespace:
-    """The structs `Pose`, a shape of every flagellum and body, and `Increment`, a tangent vector at one."""
-    real, vec3, vec4 = p.real, p.vec3, p.vec4
-    vec6 = wp.types.vector(6, real)
-
-    @wp.struct
-    class Pose:
-        position: wp.array(dtype=vec3)  # [E], relative to the body centre [um]
-        tangent: wp.array(dtype=vec3)  # [E]
-        director: wp.array(dtype=vec3)  # [E]
-        length: wp.array(dtype=real)  # [E] [um]
-        body_position: wp.array(dtype=wp.vec3d)  # [C] [um]
-        body_orientation: wp.array(dtype=wp.quatd)  # [C]
-        body_axis: wp.array(dtype=vec3)  # [C]
+    """The struct `Increment`, a tangent vector at a pose, and the type of its body part."""
+    vec4, vec6 = p.vec4, wp.types.vector(6, p.real)
 
     @wp.struct
     class Increment:
         node: wp.array(dtype=vec4)  # [E], displacement in the lab [um] and spin [rad]
         body: wp.array(dtype=vec6)  # [C], translation [um] and rotation vector [rad]
 
-    return SimpleNamespace(Pose=Pose, Increment=Increment, vec6=vec6)
+    return SimpleNamespace(Increment=Increment, vec6=vec6)
+
+
+def allocate(model: DeviceModel) -> Any:
+    """An increment of zero, struct `Increment`."""
+    t = types(model.precision)
+    x = t.Increment()
+    x.node = wp.zeros(model.element_count, dtype=model.precision.vec4, device=model.device)
+    x.body = wp.zeros(model.cell_count, dtype=t.vec6, device=model.device)
+    return x
 
 
 @functools.cache
-def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
+def _kernels(p: Precision, transporting: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
-    t = types(p)
-    Pose, Increment, vec6 = t.Pose, t.Increment, t.vec6
-    Model, State = structs(p).Model, structs(p).State
-    f, fd = rotations.functions(p), rotations.functions(Precision("float64", p.strict))
+    Increment, vec6 = types(p).Increment, types(p).vec6
+    Model, State, Pose = structs(p).Model, structs(p).State, structs(p).Pose
+    f, fd = rotations.functions(p), rotations.functions(p.double)
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     rotation_vector_quat, rotation_vector_quatd = f.rotation_vector_quat, fd.rotation_vector_quat
-    Groups, chain_rows = simd.struct(), chain_chart_simd.rows(p, carrying, Model, Pose, Increment)
-    module = p.module("chain", "carrying" if carrying else "")
+    attached, body_axis = f.attached, f.body_axis
+    Groups, chain_rows = simd.struct(), chain_chart_simd.rows(p, transporting, Increment)
+    module = p.module("chain", "transporting" if transporting else "")
 
     @wp.func(module=module)
     def node_part(x: vec4):
@@ -84,15 +83,15 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         orientation = wp.normalize(rotation_vector_quatd(w) * start.body_orientation[c])
         end.body_position[c] = start.body_position[c] + u
         end.body_orientation[c] = orientation
-        end.body_axis[c] = vec3(wp.quat_rotate(orientation, wp.vec3d(0.0, 0.0, 1.0)))
+        end.body_axis[c] = body_axis(orientation)
 
     @wp.func(module=module)
     def retract_tripod(model: Model, start: Pose, s: real, x: Increment, k: wp.int32, c: wp.int32, end: Pose):
         """The first element of flagellum k; returns where its anchor is."""
         first = model.first_node[k]
         orientation = end.body_orientation[c]
-        y = vec3(wp.quat_rotate(orientation, wp.vec3d(model.anchor[k])))
-        m = vec3(wp.quat_rotate(orientation, wp.vec3d(model.motor_axis[k])))
+        y = attached(orientation, model.motor.anchor[k])
+        m = attached(orientation, model.motor.axis[k])
         director = turn(transport(start.director[first], start.tangent[first], m), m, s * x.node[first][3])
         end.position[first] = y
         end.tangent[first] = m
@@ -129,7 +128,7 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         b_before = vec3(real(0.0))
         a_new = vec3(real(0.0))
         b_new = vec3(real(0.0))
-        if wp.static(carrying):
+        if wp.static(transporting):
             a_before = anchor_part(a.body[c], y_old)
             b_before = anchor_part(b.body[c], y_old)
             a_new = anchor_part(a.body[c], y)
@@ -154,7 +153,7 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
             end.tangent[e] = t_new
             end.length[e] = wp.abs(stretch * length)
             end.director[e] = perpendicular_unit(rotation * start.director[e], t_new)
-            if wp.static(carrying):
+            if wp.static(transporting):
                 a_here = a.node[e]
                 b_here = b.node[e]
                 a_new += rotation * (node_part(a_here) - a_before)
@@ -164,7 +163,7 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
                 a_out.node[e] = vec4(a_new[0], a_new[1], a_new[2], a_here[3])
                 b_out.node[e] = vec4(b_new[0], b_new[1], b_new[2], b_here[3])
             e += 1
-        if wp.static(carrying) and k == model.first_flagellum[c]:
+        if wp.static(transporting) and k == model.first_flagellum[c]:
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
 
@@ -193,12 +192,12 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
         s = real(scale[c])
         chain_rows(groups, g, model.first_node, c, model, start, s, x, a, b, end, a_out, b_out)
         k_end = k + groups.count[g]
-        if wp.static(carrying) and k == model.first_flagellum[c]:
+        if wp.static(transporting) and k == model.first_flagellum[c]:
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
         while k < k_end:
             retract_tripod(model, start, s, x, k, c, end)
-            if wp.static(carrying):
+            if wp.static(transporting):
                 first = model.first_node[k]
                 a_out.node[first] = a.node[first]
                 b_out.node[first] = b.node[first]
@@ -211,25 +210,29 @@ def _kernels(p: Precision, carrying: bool) -> SimpleNamespace:
 
 def retract(
     model: DeviceModel,
-    state: Any,
+    state: DeviceState,
     start: Any,
-    scale: Any,
+    scale: wp.array,
     x: Any,
     end: Any,
-    carry: tuple[Any, Any, Any, Any] | None = None,
+    transported: tuple[Any, Any, Any, Any] | None = None,
 ) -> None:
-    """The pose `end` reached from `start` by the increment scale * x, and two increments carried along.
+    """The pose `end` reached from `start` by the increment scale * x, and two increments transported along.
 
     Args:
-        scale: per cell, shape [cell_count].
-        carry: increments a, b at `start` and where they go: (a, b, a_out, b_out); all four differ. None: just the pose.
+        model, state: of the batch; the state says which cells are active.
+        start, end: struct `Pose`; may be one and the same.
+        scale: shape [cell_count].
+        x: struct `Increment`.
+        transported: increments a, b at `start` and where they go: (a, b, a_out, b_out), all four different. None: just
+            the pose.
     """
-    kernels = _kernels(model.precision, carry is not None)
-    a, b, a_out, b_out = carry or (x, x, x, x)
+    kernels = _kernels(model.precision, transported is not None)
+    a, b, a_out, b_out = transported or (x, x, x, x)
     inputs = [model.data, state.data, start, scale, x, end]
     wp.launch(kernels.retract_bodies, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, start, scale, x, a, b, end, a_out, b_out]
-    if model.one_thread_per_cell:
+    if model.plan.chains == "simd":
         groups = model.groups
         wp.launch(kernels.retract_groups, len(groups.first), inputs=[groups, *inputs], device=model.device)
     else:

@@ -3,8 +3,8 @@
 A node moves as r = r_0 + Q (d + x): d is its offset from the anchor at the start of the step, x its increment and
 Q = exp(t W) the rotation of its flagellum at the angular velocity W fitted to the velocities at the start. Directors
 follow the tangent by the minimal rotation inside that rotating frame and then turn by the spin increment. The
-rotation of a helix about its axis, most of its motion, is thus carried exactly and the increments stay small and
-smooth; with W = 0 this is the plain chart. The rates are exact in either: no order is lost to the chart.
+rotation of a helix about its axis, most of its motion, is thus represented exactly, and the increments stay small and
+smooth; with W = 0 they are plain displacements. The rates are exact for any W: the chart costs no order of accuracy.
 """
 
 import functools
@@ -13,7 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import rotations
 
 vec6d = wp.types.vector(6, wp.float64)
@@ -21,22 +22,17 @@ vec6d = wp.types.vector(6, wp.float64)
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Chart`: the state at the start of the step and the increments and rates since."""
-    vec3, vec4, mat33 = p.vec3, p.vec4, p.mat33
+    """The struct `Chart`: the pose at the start of the step, and the increments and rates since."""
+    vec3, vec4, mat33, Pose = p.vec3, p.vec4, p.mat33, structs(p).Pose
 
     @wp.struct
     class Chart:
-        # The start of the step.
-        base_position: wp.array(dtype=vec3)  # [E] [um]
-        base_tangent: wp.array(dtype=vec3)  # [E]
-        base_director: wp.array(dtype=vec3)  # [E]
-        base_body_position: wp.array(dtype=wp.vec3d)  # [C] [um]
-        base_body_orientation: wp.array(dtype=wp.quatd)  # [C]
+        base: Pose  # at the start of the step; without lengths and body axis
         flagellum_spin: wp.array(dtype=vec3)  # [K], W [rad/s]
         # Now.
         elapsed: wp.array(dtype=wp.float64)  # [C], time since the start of the step [s]
-        commit: wp.array(dtype=wp.int32)  # [C], 1: the placed state becomes the start of the next step
-        rest: wp.array(dtype=wp.int32)  # [C], 1: the placed state is a start of a step (its increments vanish)
+        commit: wp.array(dtype=wp.int32)  # [C], 1: the present pose becomes the start of the next step
+        rest: wp.array(dtype=wp.int32)  # [C], 1: the present pose is the start of a step (its increments vanish)
         flagellum_turn: wp.array(dtype=mat33)  # [K], Q
         increment: wp.array(dtype=vec4)  # [E], node x [um] and spin [rad]
         rate: wp.array(dtype=vec4)  # [E] [um/s, rad/s]
@@ -47,6 +43,27 @@ def struct(p: Precision) -> Any:
         body_angle: wp.array(dtype=wp.float64)  # [C], body about its axis e_b3 [rad]
 
     return Chart
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Chart`, zero."""
+    p, device = model.precision, model.device
+    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    chart = struct(p)()
+    for name in ("position", "tangent", "director"):
+        setattr(chart.base, name, zeros(elements, p.vec3))
+    chart.base.body_position, chart.base.body_orientation = zeros(cells, wp.vec3d), zeros(cells, wp.quatd)
+    chart.flagellum_spin, chart.flagellum_turn = zeros(flagella, p.vec3), zeros(flagella, p.mat33)
+    chart.elapsed = zeros(cells, wp.float64)
+    chart.commit, chart.rest = zeros(cells, wp.int32), zeros(cells, wp.int32)
+    chart.increment, chart.rate = zeros(elements, p.vec4), zeros(elements, p.vec4)
+    chart.body_increment, chart.body_rate = zeros(cells, vec6d), zeros(cells, vec6d)
+    chart.motor_angle, chart.body_angle = zeros(flagella, wp.float64), zeros(cells, wp.float64)
+    return chart
 
 
 @functools.cache
@@ -60,19 +77,19 @@ def functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def find_rate(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, c: wp.int32):
         first = model.first_node[k]
-        t = state.tangent[e]
-        base = chart.base_tangent[e]
-        spin = model.spin_mobility[k] * state.spin_torque[e]
+        t = state.pose.tangent[e]
+        base = chart.base.tangent[e]
+        spin = model.drag.spin_mobility[k] * state.spin_torque[e]
         if e == first:
             spin -= transport_spin(base, t, wp.cross(state.body_spin[c], t))
             chart.rate[e] = vec4(real(0.0), real(0.0), real(0.0), spin)
             return
         back = wp.transpose(chart.flagellum_turn[k])
         omega = chart.flagellum_spin[k]
-        offset = state.position[e] - state.position[first]
+        offset = state.pose.position[e] - state.pose.position[first]
         x_rate = back * (state.velocity[e] - state.velocity[first] - wp.cross(omega, offset))
         relative = state.velocity[e] - state.velocity[e - 1]
-        t_rate = (relative - wp.dot(relative, t) * t) / state.length[e] - wp.cross(omega, t)
+        t_rate = (relative - wp.dot(relative, t) * t) / state.pose.length[e] - wp.cross(omega, t)
         spin -= wp.dot(omega, t) + transport_spin(base, back * t, back * t_rate)
         chart.rate[e] = vec4(x_rate[0], x_rate[1], x_rate[2], spin)
 
@@ -116,16 +133,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
         k = model.flagellum_of[e]
-        director = state.director[e]
+        director = state.pose.director[e]
         if e == model.first_node[k]:
             # The motor's turn in this step, seen from the body.
-            old = wp.quat_rotate_inv(chart.base_body_orientation[c], wp.vec3d(chart.base_director[e]))
-            new = wp.quat_rotate_inv(state.body_orientation[c], wp.vec3d(director))
-            axis = wp.vec3d(model.motor_axis[k])
+            old = wp.quat_rotate_inv(chart.base.body_orientation[c], wp.vec3d(chart.base.director[e]))
+            new = wp.quat_rotate_inv(state.pose.body_orientation[c], wp.vec3d(director))
+            axis = wp.vec3d(model.motor.axis[k])
             chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
-        chart.base_position[e] = state.position[e]
-        chart.base_tangent[e] = state.tangent[e]
-        chart.base_director[e] = director
+        chart.base.position[e] = state.pose.position[e]
+        chart.base.tangent[e] = state.pose.tangent[e]
+        chart.base.director[e] = director
 
     @wp.kernel(module=module)
     def commit_bodies(
@@ -140,9 +157,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
         b = chart.body_increment[c]
-        chart.body_angle[c] += wp.dot(wp.vec3d(b[3], b[4], b[5]), wp.vec3d(state.body_axis[c]))
-        chart.base_body_position[c] = state.body_position[c]
-        chart.base_body_orientation[c] = state.body_orientation[c]
+        chart.body_angle[c] += wp.dot(wp.vec3d(b[3], b[4], b[5]), wp.vec3d(state.pose.body_axis[c]))
+        chart.base.body_position[c] = state.pose.body_position[c]
+        chart.base.body_orientation[c] = state.pose.body_orientation[c]
         chart.body_increment[c] = vec6d(wp.float64(0.0))
 
     @wp.kernel(module=module)
@@ -161,15 +178,15 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         # Least squares over node velocities relative to the anchor. Spins count little: a straight rod needs them to be
         # regular, but while they relax they are no rotation of the flagellum and would spoil the fit.
-        weight = real(0.01) * model.segment_length[k] * model.segment_length[k]
+        weight = real(0.01) * model.rod.segment_length[k] * model.rod.segment_length[k]
         matrix = mat33(real(0.0))
         moment = vec3(real(0.0))
         identity = wp.identity(3, dtype=real)
         e = first + 1
         while e < model.first_node[k + 1]:
-            d = state.position[e] - state.position[first]
-            t = state.tangent[e]
-            spin = model.spin_mobility[k] * state.spin_torque[e]
+            d = state.pose.position[e] - state.pose.position[first]
+            t = state.pose.tangent[e]
+            spin = model.drag.spin_mobility[k] * state.spin_torque[e]
             matrix += wp.dot(d, d) * identity - wp.outer(d, d) + weight * wp.outer(t, t)
             moment += wp.cross(d, state.velocity[e] - state.velocity[first]) + (weight * spin) * t
             e += 1
@@ -233,7 +250,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def commit(model: DeviceModel, state: DeviceState, chart: Any) -> None:
-    """The placed state becomes the start of the next step, in cells where `commit` is set."""
+    """The present pose becomes the start of the next step, in cells where `commit` is set."""
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart]
     wp.launch(kernels.commit_elements, model.element_count, inputs=inputs, device=model.device)
@@ -250,7 +267,7 @@ def increment_rates(model: DeviceModel, state: DeviceState, chart: Any) -> None:
     """Rates of the increments from the velocities, into `rate` and `body_rate`."""
     kernels = _kernels(model.precision)
     inputs = [model.data, state.data, chart]
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.rates_by_cells, model.cell_count, inputs=inputs, device=model.device)
         return
     wp.launch(kernels.rates, model.element_count, inputs=inputs, device=model.device)

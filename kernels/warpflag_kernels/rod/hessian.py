@@ -1,9 +1,9 @@
 """Second derivatives of the elastic energy of every joint and segment.
 
-A joint sees two segment vectors e, f and their spins. With W = m1 w1 + m2 w2 the bending moments' share and S_e, S_f
-the directors weighted by the moments, the closed forms below are those of discrete elastic rods (Bergou 2010),
-written for directors that follow their tangents. They are the symmetric part: the antisymmetric one is half the net
-spin torque of a segment, which its tiny spin drag keeps near zero.
+A joint's energy depends on two segment vectors e, f and their spins. With W = m1 w1 + m2 w2, the sum of bending moments
+times strains, and S_e, S_f the directors weighted by the moments, the closed forms below are those of discrete elastic
+rods (Bergou 2010), written for directors that follow their tangents. They are the symmetric part: the antisymmetric one
+is half the net spin torque of a segment, which its small spin drag keeps near zero.
 """
 
 import functools
@@ -12,8 +12,9 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
-from warpflag_kernels.rod import rotations
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.rod import chain_chart, rotations
 
 
 @functools.cache
@@ -40,6 +41,7 @@ def struct(p: Precision) -> Any:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Stiffness = structs(p).Model, structs(p).State, struct(p)
+    Increment = chain_chart.types(p).Increment
     twist_angle = rotations.functions(p).twist_angle
     module = p.module("hessian")
 
@@ -61,31 +63,31 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         k = model.flagellum_of[i]
         first = model.first_node[k]
-        h = model.segment_length[k]
-        t = state.tangent[i]
-        le = state.length[i]
+        h = model.rod.segment_length[k]
+        t = state.pose.tangent[i]
+        le = state.pose.length[i]
         identity = wp.identity(3, dtype=real)
         tt = wp.outer(t, t)
         if i > first:
-            stretching = model.stretching_stiffness[k]
+            stretching = model.rod.stretching_stiffness[k]
             strain = le / h - real(1.0)
             stiffness.stretch[i] = (stretching / h) * tt + (stretching * strain / le) * (identity - tt)
         if i + 1 == model.first_node[k + 1]:
             return
-        u = state.tangent[i + 1]
-        lf = state.length[i + 1]
-        a1 = state.director[i]
-        b1 = state.director[i + 1]
+        u = state.pose.tangent[i + 1]
+        lf = state.pose.length[i + 1]
+        a1 = state.pose.director[i]
+        b1 = state.pose.director[i + 1]
         chi = real(1.0) + wp.dot(t, u)
         kb = wp.cross(t, u) * (real(2.0) / chi)
         tm = (t + u) / chi
         twist = twist_angle(t, u, a1, b1)
         half = real(0.5)
         quarter = real(0.25)
-        c3 = model.twist_rigidity[k] / h
-        w3 = twist - model.rest_strain[k][2]
+        c3 = model.rod.twist_rigidity[k] / h
+        w3 = twist - model.rod.rest_strain[k][2]
         if i == first:
-            c3 = model.hook_rigidity[k] / h
+            c3 = model.rod.hook_rigidity[k] / h
             w3 = twist
         m3 = c3 * w3
         # Bending; the hook has none.
@@ -97,9 +99,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         w1 = half * wp.dot(kb, a1 + b1)
         w2 = half * wp.dot(kb, a2 + b2)
         if i > first:
-            c = model.bending_rigidity[k] / h
-            m1 = c * (w1 - model.rest_strain[k][0])
-            m2 = c * (w2 - model.rest_strain[k][1])
+            c = model.rod.bending_rigidity[k] / h
+            m1 = c * (w1 - model.rod.rest_strain[k][0])
+            m2 = c * (w2 - model.rod.rest_strain[k][1])
         d1 = (a1 + b1) / chi
         d2 = (a2 + b2) / chi
         # Derivatives of w1, w2 with respect to the spins.
@@ -145,10 +147,77 @@ def _kernels(p: Precision) -> SimpleNamespace:
         fe += wp.outer(ts, tm) - wp.outer(tm, us + (m3 * half) * kb) + wp.skew(sm - (m3 / chi) * t)
         stiffness.fe[i] = fe / (le * lf)
 
-    return SimpleNamespace(joints=joints)
+    @wp.func(module=module)
+    def displacement(model: Model, state: State, x: Increment, e: wp.int32, k: wp.int32):
+        """Displacement of node e under an increment; r_0 follows the body."""
+        if e == model.first_node[k]:
+            b = x.body[model.cell_of[e]]
+            return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), state.pose.position[e])
+        n = x.node[e]
+        return vec3(n[0], n[1], n[2])
+
+    @wp.kernel(module=module)
+    def joint_changes(
+        # Model:
+        model: Model,
+        # State:
+        stiffness: Stiffness,
+        x: Increment,
+        # Out:
+        state: State,
+    ):
+        i = wp.tid()
+        c = model.cell_of[i]
+        k = model.flagellum_of[i]
+        if state.active[c] == 0:
+            return
+        b = x.body[c]
+        here = displacement(model, state, x, i, k)
+        e = wp.cross(vec3(b[3], b[4], b[5]), state.pose.tangent[i])
+        if i > model.first_node[k]:
+            e = here - displacement(model, state, x, i - 1, k)
+            state.stretch_change[i] = stiffness.stretch[i] * e
+        if i + 1 == model.first_node[k + 1]:
+            return
+        f = displacement(model, state, x, i + 1, k) - here
+        first = x.node[i][3]
+        second = x.node[i + 1][3]
+        ge = stiffness.ee[i] * e + wp.transpose(stiffness.fe[i]) * f
+        gf = stiffness.fe[i] * e + stiffness.ff[i] * f
+        state.joint_before[i] = ge + first * stiffness.e_first[i] + second * stiffness.e_second[i]
+        state.joint_after[i] = gf + first * stiffness.f_first[i] + second * stiffness.f_second[i]
+        spins = stiffness.spins[i]
+        turn_first = wp.dot(stiffness.e_first[i], e) + wp.dot(stiffness.f_first[i], f)
+        turn_second = wp.dot(stiffness.e_second[i], e) + wp.dot(stiffness.f_second[i], f)
+        state.joint_spin_before[i] = turn_first + spins[0] * first + spins[1] * second
+        state.joint_spin_after[i] = turn_second + spins[1] * first + spins[2] * second
+
+    return SimpleNamespace(joints=joints, joint_changes=joint_changes)
 
 
 def joint_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
     """Second derivatives of the elastic energy at every joint, into `stiffness`."""
     kernel = _kernels(model.precision).joints
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data, stiffness], device=model.device)
+
+
+def joint_changes(model: DeviceModel, state: DeviceState, stiffness: Any, x: Any) -> None:
+    """First variation of the joints' energy gradients under an increment, in place of the gradients themselves.
+
+    Args:
+        model, state: of the batch; `joint_before/after`, `joint_spin_before/after` and `stretch_change` are set.
+        stiffness: second derivatives at the state's pose.
+        x: the increment, struct `Increment`.
+    """
+    kernel = _kernels(model.precision).joint_changes
+    wp.launch(kernel, model.element_count, inputs=[model.data, stiffness, x, state.data], device=model.device)
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Stiffness`, zero."""
+    p, k = model.precision, struct(model.precision)()
+    for name in ("ee", "ff", "fe", "stretch"):
+        setattr(k, name, wp.zeros(model.element_count, dtype=p.mat33, device=model.device))
+    for name in ("e_first", "e_second", "f_first", "f_second", "spins"):
+        setattr(k, name, wp.zeros(model.element_count, dtype=p.vec3, device=model.device))
+    return k

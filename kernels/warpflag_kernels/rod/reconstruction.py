@@ -1,4 +1,4 @@
-"""Placing: the state at the increments of a chart, body first, then anchors, nodes, and the frames between them."""
+"""Reconstruction of the pose from a chart's increments: bodies, anchors, nodes, and the frames between nodes."""
 
 import functools
 from types import SimpleNamespace
@@ -6,76 +6,84 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
 
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions that place one body, the root of one flagellum, one node, and one frame."""
+    """Device functions of one body, the anchor of one flagellum, one node, and one frame."""
     real, vec3 = p.real, p.vec3
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
-    f, fd = rotations.functions(p), rotations.functions(Precision("float64", p.strict))
+    f, fd = rotations.functions(p), rotations.functions(p.double)
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
+    attached, body_axis = f.attached, f.body_axis
     rotation_vector_quat, rotation_vector_quatd = f.rotation_vector_quat, fd.rotation_vector_quat
-    module = p.module("placing_functions")
+    module = p.module("reconstruction_functions")
 
     @wp.func(module=module)
-    def place_body(model: Model, chart: Chart, state: State, c: wp.int32):
+    def reconstruct_body(model: Model, chart: Chart, state: State, c: wp.int32):
         b = chart.body_increment[c]
-        turned = rotation_vector_quatd(wp.vec3d(b[3], b[4], b[5])) * chart.base_body_orientation[c]
+        turned = rotation_vector_quatd(wp.vec3d(b[3], b[4], b[5])) * chart.base.body_orientation[c]
         orientation = wp.normalize(turned)
-        state.body_position[c] = chart.base_body_position[c] + wp.vec3d(b[0], b[1], b[2])
-        state.body_orientation[c] = orientation
-        state.body_axis[c] = vec3(wp.quat_rotate(orientation, wp.vec3d(0.0, 0.0, 1.0)))
+        state.pose.body_position[c] = chart.base.body_position[c] + wp.vec3d(b[0], b[1], b[2])
+        state.pose.body_orientation[c] = orientation
+        state.pose.body_axis[c] = body_axis(orientation)
 
     @wp.func(module=module)
-    def place_root(model: Model, chart: Chart, state: State, k: wp.int32, c: wp.int32):
+    def reconstruct_anchor(model: Model, chart: Chart, state: State, k: wp.int32, c: wp.int32):
         """Anchor and motor axis of flagellum k, and the rotation of its chart."""
         first = model.first_node[k]
-        orientation = state.body_orientation[c]
-        state.position[first] = vec3(wp.quat_rotate(orientation, wp.vec3d(model.anchor[k])))
-        state.tangent[first] = vec3(wp.quat_rotate(orientation, wp.vec3d(model.motor_axis[k])))
+        orientation = state.pose.body_orientation[c]
+        state.pose.position[first] = attached(orientation, model.motor.anchor[k])
+        state.pose.tangent[first] = attached(orientation, model.motor.axis[k])
         turned = rotation_vector_quat(real(chart.elapsed[c]) * chart.flagellum_spin[k])
         chart.flagellum_turn[k] = wp.quat_to_matrix(turned)
 
     @wp.func(module=module)
-    def place_node(model: Model, chart: Chart, state: State, e: wp.int32, k: wp.int32):
+    def reconstruct_node(model: Model, chart: Chart, state: State, e: wp.int32, k: wp.int32):
         first = model.first_node[k]
         if e == first:
             return
         x = chart.increment[e]
-        offset = chart.base_position[e] - chart.base_position[first] + vec3(x[0], x[1], x[2])
-        state.position[e] = state.position[first] + chart.flagellum_turn[k] * offset
+        offset = chart.base.position[e] - chart.base.position[first] + vec3(x[0], x[1], x[2])
+        state.pose.position[e] = state.pose.position[first] + chart.flagellum_turn[k] * offset
 
     @wp.func(module=module)
-    def place_frame(model: Model, chart: Chart, state: State, e: wp.int32, k: wp.int32):
-        """Segment and director at node e, from the placed nodes."""
-        base_tangent = chart.base_tangent[e]
-        base_director = chart.base_director[e]
-        tangent = state.tangent[e]
+    def reconstruct_frame(model: Model, chart: Chart, state: State, e: wp.int32, k: wp.int32):
+        """Segment and director at node e, from its nodes."""
+        base_tangent = chart.base.tangent[e]
+        base_director = chart.base.director[e]
+        tangent = state.pose.tangent[e]
         if e > model.first_node[k]:
-            segment = state.position[e] - state.position[e - 1]
+            segment = state.pose.position[e] - state.pose.position[e - 1]
             length = wp.length(segment)
             tangent = segment / length
-            state.length[e] = length
-            state.tangent[e] = tangent
+            state.pose.length[e] = length
+            state.pose.tangent[e] = tangent
             base_tangent = chart.flagellum_turn[k] * base_tangent
             base_director = chart.flagellum_turn[k] * base_director
         director = turn(transport(base_director, base_tangent, tangent), tangent, chart.increment[e][3])
         director = perpendicular_unit(director, tangent)
-        state.director[e] = director
+        state.pose.director[e] = director
 
-    return SimpleNamespace(place_body=place_body, place_root=place_root, place_node=place_node, place_frame=place_frame)
+    return SimpleNamespace(
+        reconstruct_body=reconstruct_body,
+        reconstruct_anchor=reconstruct_anchor,
+        reconstruct_node=reconstruct_node,
+        reconstruct_frame=reconstruct_frame,
+    )
 
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     f = functions(p)
-    place_body, place_root, place_node, place_frame = f.place_body, f.place_root, f.place_node, f.place_frame
-    module = p.module("placing")
+    reconstruct_body, reconstruct_anchor = f.reconstruct_body, f.reconstruct_anchor
+    reconstruct_node, reconstruct_frame = f.reconstruct_node, f.reconstruct_frame
+    module = p.module("reconstruction")
 
     @wp.kernel(module=module)
     def bodies(
@@ -88,21 +96,20 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         c = wp.tid()
         if state.active[c] != 0:
-            place_body(model, chart, state, c)
+            reconstruct_body(model, chart, state, c)
 
     @wp.kernel(module=module)
     def roots(
         # Model:
         model: Model,
-        # State:
-        chart: Chart,
         # Out:
+        chart: Chart,
         state: State,
     ):
         k = wp.tid()
         c = model.cell_of[model.first_node[k]]
         if state.active[c] != 0:
-            place_root(model, chart, state, k, c)
+            reconstruct_anchor(model, chart, state, k, c)
 
     @wp.kernel(module=module)
     def nodes(
@@ -115,7 +122,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         e = wp.tid()
         if state.active[model.cell_of[e]] != 0:
-            place_node(model, chart, state, e, model.flagellum_of[e])
+            reconstruct_node(model, chart, state, e, model.flagellum_of[e])
 
     @wp.kernel(module=module)
     def frames_between(
@@ -128,39 +135,38 @@ def _kernels(p: Precision) -> SimpleNamespace:
     ):
         e = wp.tid()
         if state.active[model.cell_of[e]] != 0:
-            place_frame(model, chart, state, e, model.flagellum_of[e])
+            reconstruct_frame(model, chart, state, e, model.flagellum_of[e])
 
     @wp.kernel(module=module)
     def cells(
         # Model:
         model: Model,
-        # State:
-        chart: Chart,
         # Out:
+        chart: Chart,
         state: State,
     ):
         c = wp.tid()
         if state.active[c] == 0:
             return
-        place_body(model, chart, state, c)
+        reconstruct_body(model, chart, state, c)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
-            place_root(model, chart, state, k, c)
+            reconstruct_anchor(model, chart, state, k, c)
             e = model.first_node[k]
             while e < model.first_node[k + 1]:
-                place_node(model, chart, state, e, k)
-                place_frame(model, chart, state, e, k)
+                reconstruct_node(model, chart, state, e, k)
+                reconstruct_frame(model, chart, state, e, k)
                 e += 1
             k += 1
 
     return SimpleNamespace(bodies=bodies, roots=roots, nodes=nodes, frames_between=frames_between, cells=cells)
 
 
-def place(model: DeviceModel, state: DeviceState, chart: Any) -> None:
-    """State from the chart's increments."""
+def reconstruct(model: DeviceModel, state: DeviceState, chart: Any) -> None:
+    """The pose of `state` from the increments of the chart, struct `Chart`; also the rotations of its flagella."""
     inputs = [model.data, chart, state.data]
     kernels = _kernels(model.precision)
-    if model.one_thread_per_cell:
+    if model.plan.by_cells:
         wp.launch(kernels.cells, model.cell_count, inputs=inputs, device=model.device)
         return
     wp.launch(kernels.bodies, model.cell_count, inputs=inputs, device=model.device)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.types import Precision
+from warpflag_kernels.base.precision import Precision
 
 # atan x = x + x^3 P(x^2) below tan(pi/8), the minimax polynomial to a relative error of 4e-17.
 _ARCTANGENT = (
@@ -32,7 +32,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def transport(v: vec3, t: vec3, u: vec3):
-        """v, perpendicular to the unit vector t, carried by the minimal rotation that takes t onto u."""
+        """v, perpendicular to the unit vector t, transported by the minimal rotation that takes t onto u."""
         return v - (wp.dot(v, u) / (real(1.0) + wp.dot(t, u))) * (t + u)
 
     @wp.func(module=module)
@@ -102,6 +102,16 @@ def functions(p: Precision) -> SimpleNamespace:
             scale = s / angle
         return quat(w[0] * scale, w[1] * scale, w[2] * scale, c)
 
+    @wp.func(module=module)
+    def attached(orientation: wp.quatd, v: vec3):
+        """A vector that stands still in body axes, in lab axes."""
+        return vec3(wp.quat_rotate(orientation, wp.vec3d(v)))
+
+    @wp.func(module=module)
+    def body_axis(orientation: wp.quatd):
+        """The body's axis e_b3 in the lab."""
+        return vec3(wp.quat_rotate(orientation, wp.vec3d(0.0, 0.0, 1.0)))
+
     return SimpleNamespace(
         transport=transport,
         transport_spin=transport_spin,
@@ -112,4 +122,6 @@ def functions(p: Precision) -> SimpleNamespace:
         twist_angle=twist_angle,
         joint_strain=joint_strain,
         rotation_vector_quat=rotation_vector_quat,
+        attached=attached,
+        body_axis=body_axis,
     )

@@ -1,10 +1,10 @@
 """Guards: finite values, strain, twist and fold of every joint, crossed centre lines.
 
-A step too long, or a load too strong, gives finite garbage long before it gives NaN. So at a start, every `interval`
-steps and where an advance ends, these kernels look at the state and note the first violated guard of the cell; the
-stepper then stops that cell. Crossings are found by following both segments of a near pair linearly from the last
-check to this one: where the four end points become coplanar, do the segments touch? Flagella without steric forces
-may pass through each other.
+A step too long, or a load too strong, gives wrong finite numbers long before it gives NaN. So at a start, every
+`interval` steps and at the end of an advance, these kernels check the state and record the first violated guard of
+each cell; the stepper then stops that cell. Crossings are found by moving both segments of a near pair linearly from
+the last check to this one: at the times when the four end points are coplanar, do the segments touch? Flagella without
+steric forces may pass through each other.
 """
 
 import functools
@@ -15,21 +15,26 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.clock import STEP_TOLERANCE, Control
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base import clock
+from warpflag_kernels.base.clock import Control
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, search, steric
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
 
-LARGEST_STRAIN = 0.05
-LARGEST_TWIST = 0.5 * math.pi  # per joint [rad]
-SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours folded back beyond 166 degrees
-LARGEST_TURN = 2.0  # of a motor in one step [rad]: beyond, its angle is no longer followed
-ELEMENT_BITS = 26
+LARGEST_STRAIN = 0.05  # of a segment; 50 pN at the default stretching stiffness
+LARGEST_TWIST = (
+    0.5 * math.pi
+)  # per joint [rad]: beyond a quarter of a turn the discrete twist no longer resolves the rod
+SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours at more than 166 degrees; the curvature 2 tan(angle/2) diverges at 180
+LARGEST_TURN = 2.0  # of a motor in one step [rad]: angles of a step are added up, and are ambiguous from pi on
+TOUCH = 0.05  # distance at which crossing centre lines count as touching [sigma]
+ELEMENT_BITS = 26  # of a fault code: room for 67 million elements
 
 
 class Fault(IntEnum):
-    """What a guard found; the lower value is reported when several fire at once."""
+    """The kinds of faults; when several guards are violated at once, the lower value is reported."""
 
     NOT_FINITE = 0
     CROSSING = 1
@@ -41,7 +46,7 @@ class Fault(IntEnum):
 
 
 def encode(kind: Fault) -> int:
-    """The fault's kind in the upper bits of the code; the element is added below."""
+    """Fault code of a kind: the kind in the upper bits; the element is added in the lower ones."""
     return int(kind) << ELEMENT_BITS
 
 
@@ -52,7 +57,7 @@ def decode(code: int) -> tuple[Fault, int]:
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Guard`: what the last check saw."""
+    """The struct `Guard`: positions at the last check, and distances moved since."""
     real, vec3 = p.real, p.vec3
 
     @wp.struct
@@ -61,11 +66,23 @@ def struct(p: Precision) -> Any:
         # Empty where nothing can cross.
         position: wp.array(dtype=vec3)  # [E], at the last check [um]
         longest: wp.array(dtype=real)  # [K], its longest segment [um]
-        moved: wp.array(dtype=real)  # [K], the longest way of a node since [um]
-        strayed: wp.array(dtype=real)  # [K], from where contacts were looked for, by a stepper that does [um]
-        shifted: wp.array(dtype=real)  # [K], its longest way from where the lists of neighbours were built [um]
+        moved: wp.array(dtype=real)  # [K], largest displacement of a node since [um]
+        strayed: wp.array(dtype=real)  # [K], the same since the last search for contacts, if the stepper searches [um]
+        shifted: wp.array(dtype=real)  # [K], the same since the neighbour lists were built [um]
 
     return Guard
+
+
+def allocate(model: DeviceModel, chart: Any) -> Any:
+    """Arrays of the struct `Guard`; the start of the chart counts as checked."""
+    g = struct(model.precision)()
+    g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
+    if model.switches.has("steric"):
+        g.position = wp.clone(chart.base.position)
+        g.longest, g.moved, g.strayed, g.shifted = (
+            wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(4)
+        )
+    return g
 
 
 @functools.cache
@@ -78,23 +95,23 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     near_by = neighbours.functions(p)
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
     beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
-    Neighbours, skin = structs(p).Neighbours, wp.constant(real(neighbours.SKIN))
+    Neighbours, skin = neighbours.struct(p), wp.constant(real(neighbours.SKIN))
     Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
+    touching = wp.constant(real(TOUCH))
     least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
-    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+    advanced = clock.functions().advanced
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
-    module = p.module("guard", "listing" if listing else "")
+    module = p.module("health", "listing" if listing else "")
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
         if chart.commit[c] == 0:
             return chart.rest[c] != 0  # a start
-        left = control.target[c] - (control.time[c] + control.step[c])
-        ends = left < tolerance * control.step[c]
+        ends = advanced(control, c) >= control.target[c]
         return ends or (control.steps[c] + 1) % guard.interval[c] == 0
 
     @wp.kernel(module=module)
@@ -113,8 +130,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         if state.active[c] == 0 or not due(control, guard, chart, c):
             return
         k = model.flagellum_of[e]
-        x = state.position[e]
-        director = state.director[e]
+        x = state.pose.position[e]
+        director = state.pose.director[e]
         # Normalising turns a director that is not finite into zero.
         directed = wp.dot(director, director) > real(0.5)
         if not (wp.isfinite(x[0] + x[1] + x[2]) and wp.isfinite(state.spin_torque[e]) and directed):
@@ -122,14 +139,17 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             return
         if e == model.first_node[k] and wp.abs(chart.increment[e][3]) > largest_turn:
             wp.atomic_min(control.fault, c, turned + e)
-        if e > model.first_node[k] and wp.abs(state.length[e] / model.segment_length[k] - real(1.0)) > largest_strain:
+        if (
+            e > model.first_node[k]
+            and wp.abs(state.pose.length[e] / model.rod.segment_length[k] - real(1.0)) > largest_strain
+        ):
             wp.atomic_min(control.fault, c, strained + e)
         if e + 1 < model.first_node[k + 1]:
-            t = state.tangent[e]
-            u = state.tangent[e + 1]
+            t = state.pose.tangent[e]
+            u = state.pose.tangent[e + 1]
             if real(1.0) + wp.dot(t, u) < smallest_fold:
                 wp.atomic_min(control.fault, c, folded + e)
-            _sine, cosine = twist(t, u, state.director[e], state.director[e + 1])
+            _sine, cosine = twist(t, u, state.pose.director[e], state.pose.director[e + 1])
             if cosine < least_cosine:
                 wp.atomic_min(control.fault, c, twisted + e)
 
@@ -141,7 +161,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def crossed(p1: vec3, q1: vec3, p2: vec3, q2: vec3, p1n: vec3, q1n: vec3, p2n: vec3, q2n: vec3, touch: real):
-        """Whether two segments pass through each other while their ends move linearly to the new places."""
+        """Whether two segments pass through each other while their ends move linearly to new positions."""
         zero, one = real(0.0), real(1.0)
         # The volume spanned by the four ends is a cubic in time. Between its extrema it vanishes once at most; its sign
         # before and after alone would miss nearly parallel segments, which turn past parallel as they cross.
@@ -186,15 +206,25 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def met(state: State, guard: Guard, e: wp.int32, j: wp.int32, moved: real, touch: real):
-        """Whether segments e and j have passed through each other since the last look; no node has moved further."""
+        """Whether segments e and j have passed through each other since the last check.
+
+        Args:
+            moved: largest displacement of a node since [um].
+            touch: distance at which segments count as touching [um].
+        """
         away = middle(state, e) - middle(state, j)
-        half = real(0.5) * state.length[j]
-        within = real(0.5) * state.length[e] + half + touch
+        half = real(0.5) * state.pose.length[j]
+        within = real(0.5) * state.pose.length[e] + half + touch
         reach = within + real(2.0) * moved
         if not (wp.dot(away, away) < reach * reach):
             return False
         # No point of one has moved further against a point of the other than their ends have.
-        p1n, q1n, p2n, q2n = state.position[e - 1], state.position[e], state.position[j - 1], state.position[j]
+        p1n, q1n, p2n, q2n = (
+            state.pose.position[e - 1],
+            state.pose.position[e],
+            state.pose.position[j - 1],
+            state.pose.position[j],
+        )
         p1, q1, p2, q2 = guard.position[e - 1], guard.position[e], guard.position[j - 1], guard.position[j]
         dp1, dq1, dp2, dq2 = p1n - p1, q1n - q1, p2n - p2, q2n - q2
         parted = wp.max(wp.length_sq(dp1 - dp2), wp.length_sq(dq1 - dq2))
@@ -202,14 +232,14 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         reach = within + parted
         return (
             wp.dot(away, away) < reach * reach
-            and not beside(away, state.tangent[e], state.tangent[j], half, touch + parted)
+            and not beside(away, state.pose.tangent[e], state.pose.tangent[j], half, touch + parted)
             and distance(p1n, q1n - p1n, p2n, q2n - p2n) < touch + parted
             and crossed(p1, q1, p2, q2, p1n, q1n, p2n, q2n, touch)
         )
 
     @wp.func(module=module)
     def farthest(model: Model, ways: wp.array(dtype=real), c: wp.int32):
-        """The longest of these ways of the flagella of cell c."""
+        """The largest of these displacements of the flagella of cell c."""
         longest = real(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -233,20 +263,20 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0 or chart.commit[c] == 0 or not due(control, guard, chart, c):
-            return  # a start has no earlier place to come from
+            return  # a start has no earlier check
         k = model.flagellum_of[e]
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
-        touch = real(0.05) * model.steric_diameter[c]
+        touch = touching * model.steric.diameter[c]
         moved = farthest(model, guard.moved, c)
-        # What can have met between the two looks is listed, if nothing has been far from where it was looked for: as a
-        # contact, or as a neighbour.
+        # A pair that can have met between the two checks is in the list of contacts, or in the neighbour lists, if no
+        # node has been too far from its position when the list was made.
         as_contact = bool(False)
         if wp.static(listing):
             strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
-            as_contact = strayed < listed_reach * model.steric_diameter[c]
+            as_contact = strayed < listed_reach * model.steric.diameter[c]
         shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
-        if as_contact or shifted < contact_reach * model.steric_diameter[c] + skin:
+        if as_contact or shifted < contact_reach * model.steric.diameter[c] + skin:
             i = first_later(model, near, e)
             stop = candidates(model, near, e)
             if as_contact:
@@ -262,7 +292,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
                     wp.atomic_min(control.fault, c, crossing + e)
                 i += 1
             return
-        reach = real(0.5) * state.length[e] + touch + real(2.0) * moved
+        reach = real(0.5) * state.pose.length[e] + touch + real(2.0) * moved
         other = k + 1
         while other < model.first_flagellum[c + 1]:
             j = model.first_node[other] + 1
@@ -295,12 +325,12 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         strayed = real(0.0)
         while e < model.first_node[k + 1]:
             if e > model.first_node[k]:
-                longest = wp.max(longest, state.length[e])
-            moved = wp.max(moved, wp.length(state.position[e] - guard.position[e]))
-            shifted = wp.max(shifted, wp.length(state.position[e] - near.position[e]))
+                longest = wp.max(longest, state.pose.length[e])
+            moved = wp.max(moved, wp.length(state.pose.position[e] - guard.position[e]))
+            shifted = wp.max(shifted, wp.length(state.pose.position[e] - near.position[e]))
             shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
             if wp.static(listing):
-                strayed = wp.max(strayed, wp.length(state.position[e] - listed.position[e]))
+                strayed = wp.max(strayed, wp.length(state.pose.position[e] - listed.position[e]))
                 strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
             e += 1
         guard.longest[k] = longest
@@ -323,7 +353,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] != 0 and due(control, guard, chart, c):
-            guard.position[e] = state.position[e]
+            guard.position[e] = state.pose.position[e]
 
     return SimpleNamespace(
         check_elements=check_elements, check_crossings=check_crossings, measure_moves=measure_moves, remember=remember
@@ -331,17 +361,18 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
 
 
 def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control, listed: Any = None) -> None:
-    """Looks at every start and every completed step that is due, and notes the first violated guard of each cell in
-    `fault`.
+    """Checks every start and every completed step that is due; records the first violated guard of a cell in `fault`.
 
     Args:
-        listed: contacts that have been looked for between the last look and this one, if any.
+        model, state: of the batch.
+        chart, guard, control: structs `Chart`, `Guard`, `Control`.
+        listed: struct `Contacts` of a search made between the last check and this one, if any.
     """
     p, listing = model.precision, listed is not None
     kernels = _kernels(p, listing)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
-    if model.switches.steric:
+    if model.switches.has("steric"):
         found = listed if listing else contact_list.struct(p)()
         moves = [model.data, state.data, state.neighbours, found, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
@@ -350,8 +381,8 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
-    """Keeps the checked pose: the next check looks for crossings since then."""
-    if model.switches.steric:
+    """Stores the checked positions, from which the next check follows the segments."""
+    if model.switches.has("steric"):
         inputs = [model.data, state.data, control, chart, guard]
         kernel = _kernels(model.precision, False).remember
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

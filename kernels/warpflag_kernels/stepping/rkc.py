@@ -4,11 +4,11 @@ Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increme
 
     Y_1 = m_1 dt F_0,     Y_j = mu_j Y_(j-1) + nu_j Y_(j-2) + m_j dt F_(j-1) + g_j dt F_0,     s stages.
 
-Every cell runs its own small state machine, one right-hand side per pass, so cells of a batch need not agree on
-step or stage count. Its `stage` says what this pass evaluates:
+Every cell has a stage counter of its own and evaluates one right-hand side per pass, so cells of a batch need not agree
+on step or number of stages. Its `stage` says what this pass evaluates:
 
     -1       the state itself, after a start or a change from outside
-     0       a probe next to it: one step of the power method for the spectral radius, which sets the stage count
+     0       a point near it, the probe: one iteration of the power method for the spectral radius, which sets s
      1..s    Y_j; the last one is the new state, and its right-hand side is the F_0 of the next step
 """
 
@@ -18,28 +18,34 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, STEP_TOLERANCE, Control
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
+from warpflag_kernels.stepping import chebyshev as chebyshev_polynomials
 from warpflag_kernels.stepping import step_control
 from warpflag_kernels.stepping.step_control import StepControl
 
-DAMPING = 2.0 / 13.0
-# Norm of the probe: spins in rad, displacements in segment lengths.
+DAMPING = 2.0 / 13.0  # of the stability polynomial, as in the paper above
+STAGE_FACTOR = 1.54  # stages: 1 + (1 + 1.54 dt spectral radius)^1/2, as in the paper above
+# Norm of the probe, spins in rad, displacements in segment lengths: about the root of the precision, at which
+# truncation and round-off of a difference are alike.
 PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
-EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}
+EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last place of 1
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 SAFETY = 1.15
-FIRST_PROBES = 40
-NOISE = 20.0  # times the usual round-off of an error estimate, above which there is certainly more in it
-# A state this stiff is past saving: the step is taken, unstable, and the guards stop the cell.
-MOST_STAGES = 1.0e4
+FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
+# The embedded estimate (0.8 and 0.4 in the paper above) exceeds the errors found in runs ten to fifty times.
+ESTIMATE_SHARE = 0.1
+NOISE = 20.0  # an estimate below this times its usual round-off is taken to be round-off
+MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unstable, and the guards stop the cell
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Rkc`: earlier stages and the clockwork of every cell."""
+    """The struct `Rkc`: earlier stages of a step, the probe, and the stage counter of every cell."""
     real, vec4 = p.real, p.vec4
 
     @wp.struct
@@ -65,6 +71,24 @@ def struct(p: Precision) -> Any:
     return Rkc
 
 
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Rkc`, zero."""
+    p, device = model.precision, model.device
+    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
+
+    def zeros(count: int, dtype: Any) -> wp.array:
+        return wp.zeros(count, dtype=dtype, device=device)
+
+    r = struct(p)()
+    r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
+    r.body_previous, r.body_before_previous, r.body_start_rate = (zeros(cells, vec6d) for _ in range(3))
+    r.stage, r.stages, r.probes_left, r.evaluations = (zeros(cells, wp.int32) for _ in range(4))
+    r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
+    r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
+    r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
+    return r
+
+
 @functools.cache
 def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
@@ -72,30 +96,20 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
+    advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
+    chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
     safety = wp.constant(wp.float64(SAFETY))
-    stage_factor = wp.constant(wp.float64(1.54))
+    rate_weight = wp.constant(real(round(0.4 * ESTIMATE_SHARE, 12)))
+    increment_weight = wp.constant(real(round(0.8 * ESTIMATE_SHARE, 12)))
+    noise_weight = wp.constant(real(round(0.4 * ESTIMATE_SHARE, 12) * NOISE))
+    stage_factor = wp.constant(wp.float64(STAGE_FACTOR))
     epsilon = wp.constant(real(EPSILON[p.name]))
     most_stages = wp.constant(wp.float64(MOST_STAGES))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
-
-    @wp.func(module=module)
-    def chebyshev(j: wp.int32, theta: wp.float64):
-        """T_j, T_j', T_j'' at cosh(theta)."""
-        n = wp.float64(j)
-        sh = wp.sinh(theta)
-        value = wp.cosh(n * theta)
-        slope = n * wp.sinh(n * theta) / sh
-        return wp.vec3d(value, slope, (n * n * value - wp.cosh(theta) * slope) / (sh * sh))
-
-    @wp.func(module=module)
-    def weight(j: wp.int32, theta: wp.float64):
-        """b_j; b_0 = b_1 = b_2."""
-        c = chebyshev(wp.max(j, 2), theta)
-        return c[2] / (c[1] * c[1])
 
     @wp.kernel(module=module)
     def schedule(
@@ -103,10 +117,10 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        control: Control,
         steps: StepControl,
-        rkc: Rkc,
         # Out:
+        control: Control,
+        rkc: Rkc,
         chart: Chart,
     ):
         c = wp.tid()
@@ -181,8 +195,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
-        rkc: Rkc,
         # Out:
+        rkc: Rkc,
         chart: Chart,
     ):
         e = wp.tid()
@@ -230,20 +244,19 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
-        # The embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step; a tenth of it,
-        # since it exceeds the errors found in runs ten to fifty times.
+        # A share of the embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step.
         dt = real(control.step[c])
         last = model.first_node[k + 1] - 1
         worst = real(0.0)
         while e <= last:
-            d = real(0.04) * dt * (rkc.start_rate[e] + chart.rate[e]) - real(0.08) * chart.increment[e]
+            d = rate_weight * dt * (rkc.start_rate[e] + chart.rate[e]) - increment_weight * chart.increment[e]
             worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
             e += 1
-        # Rates carry the round-off of positions times the stiffness of the stretch: below NOISE times the usual an
-        # estimate means nothing.
-        reach = real(last - model.first_node[k]) * model.segment_length[k]
-        force = epsilon * reach * model.stretching_stiffness[k] / model.segment_length[k]
-        rkc.noise[k] = real(wp.static(0.04 * NOISE)) * dt * model.mobility_along[last] * force
+        # Rates carry the round-off of positions times the stiffness of the stretch; below NOISE times that an estimate
+        # is taken to be round-off.
+        reach = real(last - model.first_node[k]) * model.rod.segment_length[k]
+        force = epsilon * reach * model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
+        rkc.noise[k] = noise_weight * dt * model.drag.mobility_along[last] * force
         rkc.error[k] = worst
 
     @wp.kernel(module=module)
@@ -296,7 +309,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
                 rkc.start_rate[e] = chart.rate[e]
                 e += 1
         elif rkc.stage[c] == 0:
-            scale = real(1.0) / model.segment_length[k]
+            scale = real(1.0) / model.rod.segment_length[k]
             total = wp.float64(0.0)
             while e < end:
                 d = chart.rate[e] - rkc.start_rate[e]
@@ -311,9 +324,9 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
-        state: State,
         chart: Chart,
         # Out:
+        state: State,
         control: Control,
         rkc: Rkc,
     ):
@@ -324,15 +337,10 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         j = rkc.stage[c]
         if chart.rest[c] != 0:
             rkc.body_start_rate[c] = chart.body_rate[c]
-            t = control.time[c]
             if chart.commit[c] != 0:
                 control.steps[c] += 1
-                t += control.step[c]
-                # Steps divide what is left evenly, so the last one ends on the target itself.
-                if control.target[c] - t < tolerance * control.step[c]:
-                    t = control.target[c]
-                control.time[c] = t
-            if t >= control.target[c] or control.fault[c] != no_fault:
+                control.time[c] = advanced(control, c)
+            if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
                 state.active[c] = 0
                 wp.atomic_sub(control.unfinished, 0, 1)
             rkc.stage[c] = wp.static(1 if euler else 0)
@@ -350,7 +358,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
                 rkc.probes_left[c] = 1
                 rkc.stage[c] = 1
         elif j == rkc.stages[c]:
-            rkc.stage[c] = 1  # refused: again, shorter, from the same F_0
+            rkc.stage[c] = 1  # rejected: again, shorter, from the same F_0
         else:
             rkc.stage[c] = j + 1
 
@@ -369,14 +377,14 @@ def begin_pass(
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
-    inputs = [model.data, state.data, control, steps, rkc, chart]
+    inputs = [model.data, state.data, steps, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
 
 
 def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
-    """Estimates the error of every completed step and takes back `commit` where the step is refused."""
+    """Estimates the error of every completed step and clears `commit` where the step is rejected."""
     kernels = _kernels(model.precision, False)
     inputs = [model.data, state.data, control, chart, rkc]
     wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
@@ -385,9 +393,9 @@ def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, 
 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
-    """Keeps what later stages need and moves every cell's clockwork on."""
+    """Stores what later stages need and advances the stage counter of every cell."""
     kernels = _kernels(model.precision, euler)
     inputs = [model.data, state.data, chart, rkc]
     wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
-    inputs = [model.data, state.data, chart, control, rkc]
+    inputs = [model.data, chart, state.data, control, rkc]
     wp.launch(kernels.turn_over, model.cell_count, inputs=inputs, device=model.device)

@@ -1,13 +1,13 @@
-"""Flows that changes of forces cause within an implicit step: the pair sum, many times over at the same positions.
+"""The Rotne-Prager sum at positions that stand still during an implicit step, for many different forces.
 
-Contact forces need it, since two filaments that push each other apart drag the fluid between them along, which makes
-the gap several times harder to open than local drag alone would. So does the first iteration of a step for all forces,
-and the measurement of the step's stability. All are about what changes within a step, so single precision is enough in
-either build.
+The contact solve needs it: two filaments that push each other apart drag the fluid between them along, which makes the
+gap several times harder to open than with local drag alone. So do the velocities of a step's first iteration, and the
+measurement of its stability. Single precision is enough for all three: they enter through changes within a step, or are
+corrected by the second iteration.
 
-The places of a cell hold its moving nodes, those that contacts can load first, both flagellum after flagellum. A CPU
-keeps the coefficients of every pair (i, j < i) of a cell, row after row, unless the cell is so large that reading
-them would take as long as finding them again.
+Nodes are reordered: the slots of a cell hold its moving nodes, first those that contacts can load, then the others,
+both flagellum after flagellum. A CPU stores the coefficients of every pair (i, j < i) of a cell, row after row, unless
+the cell is so large that reading them takes as long as finding them again (`Plan.step_pairs`).
 """
 
 import functools
@@ -17,75 +17,34 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.native import native
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list
-from warpflag_kernels.fluid import node_velocity, rotne_prager
-
-KEPT = 512  # moving nodes of a cell up to which the coefficients of its pairs are kept
-
-# A row of the sum by halves over kept coefficients, the flow c f + q (q . f): pairs (i, j) for j in [begin, end).
-_ROW = """
-    const float* __restrict__ C = s.c.data + row; const float* __restrict__ A = s.qx.data + row;
-    const float* __restrict__ B = s.qy.data + row; const float* __restrict__ D = s.qz.data + row;
-    const float* __restrict__ F = s.sum.fx.data; const float* __restrict__ G = s.sum.fy.data;
-    const float* __restrict__ H = s.sum.fz.data;
-    float* __restrict__ U = s.sum.ux.data; float* __restrict__ V = s.sum.uy.data; float* __restrict__ W = s.sum.uz.data;
-    const float fi = F[i], gi = G[i], hi = H[i];
-    float ui = 0, vi = 0, wi = 0;
-    #ifndef __CUDACC__
-    #pragma clang loop vectorize(assume_safety)
-    #endif
-    for (int j = begin; j < end; ++j) {
-        const float a = A[j], b = B[j], d = D[j], c = C[j];
-        const float from_j = a * F[j] + b * G[j] + d * H[j], from_i = a * fi + b * gi + d * hi;
-        ui += c * F[j] + from_j * a; vi += c * G[j] + from_j * b; wi += c * H[j] + from_j * d;
-        U[j] += c * fi + from_i * a; V[j] += c * gi + from_i * b; W[j] += c * hi + from_i * d;
-    }
-    U[i] += ui; V[i] += vi; W[i] += wi;
-"""
-# The coefficients of a row.
-_KEEP = """
-    float* __restrict__ C = s.c.data + row; float* __restrict__ A = s.qx.data + row;
-    float* __restrict__ B = s.qy.data + row; float* __restrict__ D = s.qz.data + row;
-    const float* __restrict__ X = s.sum.x.data; const float* __restrict__ Y = s.sum.y.data;
-    const float* __restrict__ Z = s.sum.z.data;
-    const float xi = X[i], yi = Y[i], zi = Z[i], a2 = a * a;
-    #ifndef __CUDACC__
-    #pragma clang loop vectorize(assume_safety)
-    #endif
-    for (int j = begin; j < i; ++j) {
-        const float dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
-        const float r2 = dx * dx + dy * dy + dz * dz;
-        const float inv_r = 1.0f / wp::sqrt(r2 > 0.0f ? r2 : 1.0f), inv_r2 = inv_r * inv_r, q = a2 * inv_r2;
-        const bool far = r2 > 4.0f * a2;
-        C[j] = far ? inv_r * (1.0f + q * (2.0f / 3.0f)) : (4.0f / 3.0f) / a - 0.375f / a2 * (r2 * inv_r);
-        const float along = wp::sqrt(far ? inv_r * inv_r2 * (1.0f - 2.0f * q) : 0.125f / a2 * inv_r);
-        A[j] = along * dx; B[j] = along * dy; D[j] = along * dz;
-    }
-"""
+from warpflag_kernels.fluid import rotne_prager
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Flow`: which node is where in the sum, and the coefficients of its pairs."""
-    PairSum, single = structs(_single(p)).PairSum, _single(p).real
+    """The struct `StepFlow`: the order of nodes in the sum, and the coefficients of their pairs."""
+    PairSum, single = rotne_prager.struct(p.single), p.single.real
 
     @wp.struct
-    class Flow:
-        loaded: wp.array(dtype=wp.int32)  # [K], nodes that may be loaded by a contact
-        start: wp.array(dtype=wp.int32)  # [K], places of these nodes lie in [start, start + loaded)
-        rest: wp.array(dtype=wp.int32)  # [K], where those of the flagellum's other nodes begin
-        node: wp.array(dtype=wp.int32)  # [E], of a place; a cell's places begin where its elements do
-        place: wp.array(dtype=wp.int32)  # [E], of a node; -1: of r_0, which is not in the sum
-        sum: PairSum  # by place
-        # Coefficients c, q of the pairs, only where they are kept.
+    class StepFlow:
+        loaded: wp.array(dtype=wp.int32)  # [K], number of nodes that a contact may load
+        start: wp.array(dtype=wp.int32)  # [K], slots of these nodes lie in [start, start + loaded)
+        rest: wp.array(dtype=wp.int32)  # [K], first slot of the flagellum's other nodes
+        node: wp.array(dtype=wp.int32)  # [E], node of a slot; a cell's slots begin where its elements do
+        slot: wp.array(dtype=wp.int32)  # [E], slot of a node; -1: of r_0, which is not in the sum
+        sum: PairSum  # by slot
+        # Coefficients c, q of the pairs, flow = c f + q (q . f); only where they are stored.
         first_pair: wp.array(dtype=wp.int32)  # [C], of a cell's pairs
         c: wp.array(dtype=single)  # [pairs], of the force [1/um]
         qx: wp.array(dtype=single)  # [pairs], along the nodes' distance [um^-1/2]
         qy: wp.array(dtype=single)
         qz: wp.array(dtype=single)
 
-    return Flow
+    return StepFlow
 
 
 @functools.cache
@@ -102,59 +61,59 @@ def rows(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pairs: str, form: str, lanes: int = 1) -> SimpleNamespace:
-    """Device functions for one block of threads, in this order, its lanes meeting in between: `load` every node,
+def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNamespace:
+    """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
     `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`. Lanes: threads
     that share what is gathered at a node, one or those of a warp."""
-    real, vec3, single = p.real, p.vec3, _single(p)
+    real, vec3, single = p.real, p.vec3, p.single
     Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
-    add_row, gather_pairs = rotne_prager.rows(single, lanes).add_row, rotne_prager.rows(single, lanes).gather_pairs
+    add_row, gather_pairs = rotne_prager.rows(single, threads).add_row, rotne_prager.rows(single, threads).gather_pairs
     warp_sum = rotne_prager.over_warp(single)
     within, between = pairs in ("within", "all"), pairs in ("between", "all")
     zero = wp.constant(single.real(0.0))
-    halves, kept = form != "gathered", form == "kept"
-    module = p.module("flow_functions", f"{pairs}_{form}_{lanes}")
+    symmetric, stored = form != "gathered", form == "stored"
+    module = p.module("flow_functions", f"{pairs}_{form}_{threads}")
 
     @wp.func(module=module)
-    def load(flow: Flow, place: wp.int32, f: vec3):
-        """Puts a force on the node of a place [pN]."""
-        flow.sum.fx[place] = single.real(f[0])
-        flow.sum.fy[place] = single.real(f[1])
-        flow.sum.fz[place] = single.real(f[2])
-        if wp.static(halves):
-            flow.sum.ux[place] = zero
-            flow.sum.uy[place] = zero
-            flow.sum.uz[place] = zero
+    def load(flow: Flow, slot: wp.int32, f: vec3):
+        """Puts a force on the node of a slot [pN]."""
+        flow.sum.fx[slot] = single.real(f[0])
+        flow.sum.fy[slot] = single.real(f[1])
+        flow.sum.fz[slot] = single.real(f[2])
+        if wp.static(symmetric):
+            flow.sum.ux[slot] = zero
+            flow.sum.uy[slot] = zero
+            flow.sum.uz[slot] = zero
 
     @wp.func(module=module)
-    def places_end(model: Model, c: wp.int32):
-        """Where the places of a cell end."""
+    def slots_end(model: Model, c: wp.int32):
+        """Where the slots of a cell end."""
         return model.first_node[model.first_flagellum[c + 1]] - model.first_flagellum[c + 1] + model.first_flagellum[c]
 
     @wp.func(module=module)
     def loaded_end(model: Model, flow: Flow, c: wp.int32):
-        """Where the places of a cell's nodes end that contacts can load."""
+        """Where the slots of a cell's nodes end that contacts can load."""
         last = model.first_flagellum[c + 1] - 1
         return flow.start[last] + flow.loaded[last]
 
-    @wp.func_native(_ROW)
-    def add_kept_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32): ...
+    @wp.func_native(native(__file__, "stored_row", single))
+    def add_stored_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32): ...
 
     @wp.func(module=module)
     def add(model: Model, flow: Flow, c: wp.int32, i: wp.int32, begin: wp.int32, end: wp.int32):
         if begin < end:
-            if wp.static(kept):
+            if wp.static(stored):
                 first = model.first_node[model.first_flagellum[c]]
-                add_kept_row(flow, row_of(flow, first, c, i), i, begin, end)
+                add_stored_row(flow, row_of(flow, first, c, i), i, begin, end)
             else:
-                add_row(flow.sum, i, begin, end, single.real(model.pair_radius[c]))
+                add_row(flow.sum, i, begin, end, single.real(model.pairs.radius[c]))
 
     @wp.func(module=module)
     def spread(model: Model, flow: Flow, c: wp.int32, sources: wp.int32):
-        """The sum by halves, where one thread does a whole cell; beyond the places `sources` nothing is loaded."""
+        """The symmetric sum of a whole cell by one thread; slots from `sources` on carry no force."""
         begin = model.first_node[model.first_flagellum[c]]
-        end = places_end(model, c)
+        end = slots_end(model, c)
         i = begin
         while i < end:
             stop = wp.min(i, sources)
@@ -174,47 +133,47 @@ def functions(p: Precision, pairs: str, form: str, lanes: int = 1) -> SimpleName
             i += 1
 
     @wp.func(module=module)
-    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32, lane: wp.int32):
+    def flow_at(model: Model, flow: Flow, e: wp.int32, k: wp.int32, c: wp.int32, sources: wp.int32, thread: wp.int32):
         """Velocity of node e of flagellum k that the forces cause through the pair sum [um/s]."""
-        i = flow.place[e]
+        i = flow.slot[e]
         ux = zero
         uy = zero
         uz = zero
-        if wp.static(halves):
+        if wp.static(symmetric):
             ux = flow.sum.ux[i]
             uy = flow.sum.uy[i]
             uz = flow.sum.uz[i]
         else:
             begin = model.first_node[model.first_flagellum[c]]
-            radius = single.real(model.pair_radius[c])
+            radius = single.real(model.pairs.radius[c])
             u = single.vec3(zero)
             if wp.static(within and between):
-                u = gather_pairs(flow.sum, i, begin + lane, sources, radius)
+                u = gather_pairs(flow.sum, i, begin + thread, sources, radius)
             else:
                 start = flow.start[k]
                 loaded = start + flow.loaded[k]
                 rest = flow.rest[k]
                 others = rest + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
                 if wp.static(within):
-                    u = gather_pairs(flow.sum, i, start + lane, wp.min(loaded, sources), radius)
-                    u += gather_pairs(flow.sum, i, rest + lane, wp.min(others, sources), radius)
+                    u = gather_pairs(flow.sum, i, start + thread, wp.min(loaded, sources), radius)
+                    u += gather_pairs(flow.sum, i, rest + thread, wp.min(others, sources), radius)
                 else:
-                    u = gather_pairs(flow.sum, i, begin + lane, wp.min(start, sources), radius)
-                    u += gather_pairs(flow.sum, i, loaded + lane, wp.min(rest, sources), radius)
-                    u += gather_pairs(flow.sum, i, others + lane, sources, radius)
-            if wp.static(lanes > 1):
-                u = warp_sum(u)
+                    u = gather_pairs(flow.sum, i, begin + thread, wp.min(start, sources), radius)
+                    u += gather_pairs(flow.sum, i, loaded + thread, wp.min(rest, sources), radius)
+                    u += gather_pairs(flow.sum, i, others + thread, sources, radius)
+            if wp.static(threads > 1):
+                u = warp_sum(u, thread)
             ux = u[0]
             uy = u[1]
             uz = u[2]
-        return model.pair_mobility[c] * vec3(real(ux), real(uy), real(uz))
+        return model.pairs.mobility[c] * vec3(real(ux), real(uy), real(uz))
 
-    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, places_end=places_end)
+    return SimpleNamespace(load=load, spread=spread, flow_at=flow_at, loaded_end=loaded_end, slots_end=slots_end)
 
 
 @functools.cache
 def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
-    real = _single(p).real
+    real = p.single.real
     Model, State, Contacts, Flow = structs(p).Model, structs(p).State, contact_list.struct(p), struct(p)
     row_of, module = rows(p), p.module("flow", "touching" if touching else "")
 
@@ -278,25 +237,25 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
         flow.start[own] = loaded
         flow.rest[own] = unloaded
         while e < end:
-            place = loaded
+            slot = loaded
             if may_be_loaded(contacts_in, e, end):
                 loaded += 1
             else:
-                place = unloaded
+                slot = unloaded
                 unloaded += 1
-            flow.node[place] = e
-            flow.place[e] = place
-            x = state.position[e]
-            flow.sum.x[place] = real(x[0])
-            flow.sum.y[place] = real(x[1])
-            flow.sum.z[place] = real(x[2])
+            flow.node[slot] = e
+            flow.slot[e] = slot
+            x = state.pose.position[e]
+            flow.sum.x[slot] = real(x[0])
+            flow.sum.y[slot] = real(x[1])
+            flow.sum.z[slot] = real(x[2])
             e += 1
 
-    @wp.func_native(_KEEP)
-    def keep_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
+    @wp.func_native(native(__file__, "store_row", p.single, TENSOR=rotne_prager.tensor_code(p.single)))
+    def store_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
 
     @wp.kernel(module=module)
-    def keep(
+    def store(
         # Model:
         model: Model,
         # State:
@@ -310,14 +269,14 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
         end -= model.first_flagellum[c + 1] - model.first_flagellum[c]
         i = first
         while i < end and state.active[c] != 0:
-            keep_row(flow, row_of(flow, first, c, i), i, first, real(model.pair_radius[c]))
+            store_row(flow, row_of(flow, first, c, i), i, first, real(model.pairs.radius[c]))
             i += 1
 
-    return SimpleNamespace(count=count, arrange=arrange, keep=keep)
+    return SimpleNamespace(count=count, arrange=arrange, store=store)
 
 
 def allocate(model: DeviceModel) -> Any:
-    """Arrays of the struct `Flow`; none where forces cause no flows."""
+    """Arrays of the struct `StepFlow`; none where forces cause no flows."""
     flow, device = struct(model.precision)(), model.device
     if model.switches.pairs == "none":
         return flow
@@ -327,12 +286,12 @@ def allocate(model: DeviceModel) -> Any:
 
     flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
     flow.node = zeros(model.element_count, wp.int32)
-    flow.place = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
-    form = form_of(model)
+    flow.slot = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
+    form = model.plan.step_pairs
     results = () if form == "gathered" else ("ux", "uy", "uz")
     for name in ("x", "y", "z", "fx", "fy", "fz", *results):
         setattr(flow.sum, name, zeros(model.element_count, wp.float32))
-    if form == "kept":
+    if form == "stored":
         first_flagellum = model.data.first_flagellum.numpy()
         moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
         pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])
@@ -349,17 +308,5 @@ def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = 
     inputs = [model.data, state.data, listed, flow]
     wp.launch(kernels.count, model.flagellum_count, inputs=inputs, device=device)
     wp.launch(kernels.arrange, model.flagellum_count, inputs=inputs, device=device)
-    if form_of(model) == "kept":
-        wp.launch(kernels.keep, model.cell_count, inputs=[model.data, state.data, flow], device=device)
-
-
-def form_of(model: DeviceModel) -> str:
-    """How the sum is done: "kept" and "halves" take every pair once, with coefficients kept or not, "gathered" at each
-    of its nodes."""
-    if not node_velocity.sums_by_halves(model):
-        return "gathered"
-    return "kept" if model.largest_cell <= KEPT else "halves"
-
-
-def _single(p: Precision) -> Precision:
-    return Precision("float32", p.strict)
+    if model.plan.step_pairs == "stored":
+        wp.launch(kernels.store, model.cell_count, inputs=[model.data, state.data, flow], device=device)

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
-from warpflag_kernels.base.types import DeviceModel
 from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side, stages
 
 from tests.helpers import cell, shaken, touching_cell
-from warpflag.model.terms import launch_right_hand_side, right_hand_side
+from tests.plans import by_elements
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene
 
-PLACED = ("position", "tangent", "director", "length", "body_position", "body_orientation", "body_axis")
+POSE = ("position", "tangent", "director", "length", "body_position", "body_orientation", "body_axis")
 FOUND = (
     "joint_before", "joint_after", "joint_spin_before", "joint_spin_after", "steric_first", "steric_second",
     "body_contact", "force", "spin_torque", "velocity", "flagellum_force", "flagellum_torque", "body_velocity",
@@ -44,7 +46,7 @@ def batch(values: dict[str, Any], precision: str, device: str) -> Simulation:
     ]
     starts = [shaken(scene, seed, node=0.002) for seed, scene in enumerate(scenes)]
     sim = Simulation(scenes, device=device, starts=starts)
-    if not sim.system.model.one_thread_per_cell:
+    if not sim.system.model.plan.by_cells:
         pytest.skip("a thread takes a whole cell on a CPU alone")
     sim.evaluate()
     return sim
@@ -80,19 +82,19 @@ def test_a_right_hand_side_at_once_is_its_stages(terms, active, precision, devic
     state.data.active.assign(active)
 
     def by_stages() -> None:
-        for stage in right_hand_side(model.switches):
-            stage.launch(model, state)
+        for _name, launch in stages(model):
+            launch(model, state)
 
     found = []
     for launch in (lambda: launch_right_hand_side(model, state), by_stages):
-        if model.switches.steric:
+        if model.switches.has("steric"):
             state.neighbours.position.fill_(1e30)  # lists are to be made anew
         found.append(written(state.data, FOUND, launch))
     check(sim, *found, first=bool(active[0]))
 
 
 @pytest.mark.parametrize("active", [[1, 1, 1], [0, 1, 1]], ids=["all cells", "one idle"])
-def test_placing_and_rates_at_once_are_those_of_every_element(active, precision, device, monkeypatch):
+def test_reconstruction_and_rates_at_once_are_those_of_every_element(active, precision, device):
     sim = batch({}, precision, device)
     model, state, c = sim.system.model, sim.system.state, sim.system.chart
     state.data.active.assign(active)
@@ -101,16 +103,13 @@ def test_placing_and_rates_at_once_are_those_of_every_element(active, precision,
     c.body_increment.assign(random.uniform(-0.5, 0.5, (model.cell_count, 6)))
     c.flagellum_spin.assign(random.uniform(-1e3, 1e3, (model.flagellum_count, 3)))
     c.elapsed.fill_(1e-3)
-    steps = ((state.data, PLACED, lambda: reconstruction.place(model, state, c)),)
-    steps += ((c, RATES, lambda: comoving_chart.increment_rates(model, state, c)),)
-    for owner, names, launch in steps:
-        at_once = written(owner, names, launch)
-        with monkeypatch.context() as patch:
-            patch.setattr(DeviceModel, "one_thread_per_cell", False)
-            apart = written(owner, names, launch)
+    finely = dataclasses.replace(model, plan=by_elements(model.plan))
+    steps = ((state.data.pose, POSE, reconstruction.reconstruct), (c, RATES, comoving_chart.increment_rates))
+    for owner, names, function in steps:
+        at_once, apart = (written(owner, names, functools.partial(function, cut, state, c)) for cut in (model, finely))
         check(sim, at_once, apart, first=bool(active[0]))
 
 
 def test_the_strict_build_keeps_to_the_stages(device):
-    assert not Simulation(cell(), device=device, strict=True).system.model.one_thread_per_cell
-    assert Simulation(cell(), device=device).system.model.one_thread_per_cell == wp.get_device(device).is_cpu
+    assert not Simulation(cell(), device=device, strict=True).system.model.plan.by_cells
+    assert Simulation(cell(), device=device).system.model.plan.by_cells == wp.get_device(device).is_cpu

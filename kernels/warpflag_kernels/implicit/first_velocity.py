@@ -1,6 +1,6 @@
-"""Velocities of all nodes in single precision, through the coefficients that the contact law keeps anyway.
+"""Node velocities of the first iteration of a step: flows in single precision, from the stored pair coefficients.
 
-For the first of a step's two iterations, whose errors the second one takes out.
+The second iteration, in full precision, corrects their round-off.
 """
 
 import functools
@@ -8,25 +8,25 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.types import DeviceModel, DeviceState, Precision, structs
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import node_velocity
-from warpflag_kernels.implicit import frozen_flow as flow_stage
+from warpflag_kernels.implicit import step_flow as flow_stage
 
 
 @functools.cache
 def _kernel(p: Precision, pairs: str) -> Any:
     Model, State, Flow = structs(p).Model, structs(p).State, flow_stage.struct(p)
-    flows = flow_stage.functions(p, pairs, "kept")
+    flows = flow_stage.functions(p, pairs, "stored")
     drag_velocity = node_velocity.local(p).drag_velocity
-    load, spread, flow_at, places_end = flows.load, flows.spread, flows.flow_at, flows.places_end
+    load, spread, flow_at, slots_end = flows.load, flows.spread, flows.flow_at, flows.slots_end
 
-    @wp.kernel(module=p.module("rough_velocities", pairs))
+    @wp.kernel(module=p.module("first_velocity", pairs))
     def cells(
         # Model:
         model: Model,
-        # State:
-        flow: Flow,
         # Out:
+        flow: Flow,
         state: State,
     ):
         c = wp.tid()
@@ -36,10 +36,10 @@ def _kernel(p: Precision, pairs: str) -> Any:
         end = model.first_node[model.first_flagellum[c + 1]]
         e = begin
         while e < end:
-            if flow.place[e] >= 0:
-                load(flow, flow.place[e], state.force[e])
+            if flow.slot[e] >= 0:
+                load(flow, flow.slot[e], state.force[e])
             e += 1
-        stop = places_end(model, c)
+        stop = slots_end(model, c)
         spread(model, flow, c, stop)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -54,15 +54,15 @@ def _kernel(p: Precision, pairs: str) -> Any:
 
 
 def serves(model: DeviceModel) -> bool:
-    """Whether the model's coefficients are kept."""
-    return model.switches.pairs != "none" and flow_stage.form_of(model) == "kept"
+    """Whether the coefficients of pairs are stored."""
+    return model.plan.step_pairs == "stored"
 
 
 def node_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
     """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces.
 
     Args:
-        flow: the struct `Flow`, built for this pose; its forces are overwritten.
+        flow: the struct `StepFlow`, built for this pose; its forces are overwritten.
     """
     kernel = _kernel(model.precision, model.switches.pairs)
     wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)

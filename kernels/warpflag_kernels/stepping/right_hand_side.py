@@ -1,0 +1,124 @@
+"""The right-hand side: from positions and directors to forces, torques and velocities, built from the list of terms.
+
+Stage by stage, a launch or more for each, or a whole cell in one launch by one thread: a CPU works through the threads
+of a launch one after the other, and every launch costs it what some ten nodes do. Both call the same device functions
+in the same order, so the numbers are the same.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.contact import neighbours
+from warpflag_kernels.fluid import body, node_velocity, rotne_prager
+from warpflag_kernels.rod import forces
+
+
+@functools.cache
+def _evaluators(p: Precision, terms: tuple[Term, ...]) -> tuple[Any, Any]:
+    """Device functions: what all terms evaluate before forces are summed, for one cell and for one flagellum."""
+    Model, State, Neighbours = structs(p).Model, structs(p).State, neighbours.struct(p)
+    parts = combined(p, terms)
+    module = p.module("right_hand_side_functions", variant(terms))
+
+    def of_cell(functions: list[Any]) -> Any:
+        if not functions:
+
+            @wp.func(module=module)
+            def nothing(model: Model, state: State, near: Neighbours, c: wp.int32):
+                return
+
+            return nothing
+        earlier, last = of_cell(functions[:-1]), functions[-1]
+
+        @wp.func(module=module)
+        def cell(model: Model, state: State, near: Neighbours, c: wp.int32):
+            earlier(model, state, near, c)
+            last(model, state, near, c)
+
+        return cell
+
+    def of_flagellum(functions: list[Any]) -> Any:
+        if not functions:
+
+            @wp.func(module=module)
+            def nothing(model: Model, state: State, k: wp.int32, c: wp.int32):
+                return
+
+            return nothing
+        earlier, last = of_flagellum(functions[:-1]), functions[-1]
+
+        @wp.func(module=module)
+        def flagellum(model: Model, state: State, k: wp.int32, c: wp.int32):
+            earlier(model, state, k, c)
+            last(model, state, k, c)
+
+        return flagellum
+
+    return of_cell(parts.in_cell), of_flagellum(parts.in_flagellum)
+
+
+@functools.cache
+def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: str, form: str) -> Any:
+    Model, State = structs(p).Model, structs(p).State
+    PairSum, Neighbours = rotne_prager.struct(pair), neighbours.struct(p)
+    evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
+    gather, motion = forces.functions(p, terms).gather, body.functions(p, terms)
+    sum_flagellum, move = motion.sum_flagellum, motion.move
+    move_cell = node_velocity.functions(p, pair, pairs, form).move_cell
+    name = "_".join([variant(terms), pairs, form, *["short"] * (pair != p)])
+
+    @wp.kernel(module=p.module("whole_cell", name))
+    def right_hand_side(
+        # Model:
+        model: Model,
+        # Out:
+        state: State,
+        s: PairSum,
+        near: Neighbours,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        evaluate_cell(model, state, near, c)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            evaluate_flagellum(model, state, k, c)
+            e = model.first_node[k]
+            while e < model.first_node[k + 1]:
+                gather(model, state, e, k)
+                e += 1
+            sum_flagellum(model, state, k)
+            k += 1
+        move(model, state, c)
+        move_cell(model, state, s, c)
+
+    return right_hand_side
+
+
+def stages(model: DeviceModel) -> list[tuple[str, Callable[[DeviceModel, DeviceState], None]]]:
+    """The stages of the right-hand side in order: a name for people, and the function that launches the kernels."""
+    listed = [(term.name, term.launch) for term in model.terms if term.launch is not None]
+    listed += [("forces", forces.total_forces), ("body", body.body_motion)]
+    short = ", terms in float32" if model.switches.short_pairs else ""
+    pairs = "local drag"
+    if model.switches.pairs != "none":
+        pairs += f" and pair sum ({model.switches.pairs}{short})"
+    return [*listed, (pairs, node_velocity.node_velocities)]
+
+
+def launch_right_hand_side(model: DeviceModel, state: DeviceState) -> None:
+    """Forces, torques and velocities at the pose of `state`: a cell in one launch or stage by stage, as planned."""
+    plan = model.plan
+    if plan.by_cells:
+        kernel = _whole_cell(model.precision, plan.pair_precision, model.terms, model.switches.pairs, plan.pair_sum)
+        inputs = [model.data, state.data, state.pairs, state.neighbours]
+        wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
+        return
+    for _name, launch in stages(model):
+        launch(model, state)

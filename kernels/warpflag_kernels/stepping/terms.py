@@ -1,0 +1,21 @@
+"""The force terms of the model in their order: from this one list every right-hand side is built."""
+
+from warpflag_kernels.base.term import Term
+from warpflag_kernels.contact.pair_forces import BODY_CONTACT, STERIC
+from warpflag_kernels.motor.torque import MOTOR
+from warpflag_kernels.rod.elastic import BEARING, ELASTIC
+from warpflag_kernels.rod.external import EXTERNAL
+
+TERMS = (MOTOR, ELASTIC, BEARING, STERIC, BODY_CONTACT, EXTERNAL)
+
+
+def terms_named(names: tuple[str, ...]) -> tuple[Term, ...]:
+    """The terms of these names, in the order in which their forces are added up.
+
+    Raises:
+        ValueError: there is no term of such a name.
+    """
+    unknown = set(names) - {term.name for term in TERMS}
+    if unknown:
+        raise ValueError(f"there is no term {', '.join(sorted(unknown))}")
+    return tuple(term for term in TERMS if term.name in names)
