@@ -47,7 +47,7 @@ def test_progress_goes_on_in_silence_where_its_stream_is_broken(broken):
     now = [0.0]
     progress = Progress(1e-3, stream, clock=lambda: now[0])
     for step in range(4):
-        now[0] += 3.0
+        now[0] += 100.0
         progress.update(1e-4 * step)
     progress.close()
     let_go(stream)
@@ -64,7 +64,7 @@ SCRIPT = """
 from warpflag.base.device import start_warp
 from warpflag.base.progress import Progress
 start_warp()
-progress = Progress(1.0, clock=iter(range(0, 1000, 10)).__next__)
+progress = Progress(1.0, clock=iter(range(0, 10000, 100)).__next__)
 for step in range(5):
     progress.update(0.2 * step)
 progress.close()

@@ -95,6 +95,12 @@ def test_antiparallel_tangents_are_undefined_and_left_out():
     up, down = np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]])
     assert np.isnan(observables.local_phase_difference([[1.0, 0.0, 0.0]], up, [[1.0, 0.0, 0.0]], down)[0])
 
+    # Nearly antiparallel ones are defined: turned about e1, they leave it alone.
+    for angle in (1e-3, 1e-5):
+        tilted = np.array([[0.0, np.sin(angle), -np.cos(angle)]])
+        theta = observables.local_phase_difference([[1.0, 0.0, 0.0]], up, [[1.0, 0.0, 0.0]], tilted)
+        assert theta[0] == pytest.approx(0.0, abs=1e-6)
+
     straight = line(5)
     hairpin = np.array([[1, 0, 0], [1, 0, 1], [1, 0, 2], [1, 0, 1], [1, 0, 0]], float)
     positions, first_node = joined(straight, hairpin)
@@ -177,7 +183,7 @@ def test_zip_is_complete_once_it_holds():
     for hold, expected in ((0.0, 1e-4), (1e-4, 3e-4), (2e-4, 6e-4), (3e-4, 6e-4)):
         assert observables.zip_time(times, lengths, hold) == pytest.approx(expected)
     assert np.isnan(observables.zip_time(times, lengths, 4e-4))
-    assert np.isnan(observables.zip_time(times, np.full(10, 0.97)))
+    assert np.isnan(observables.zip_time(times, np.full(10, 0.979)))
 
 
 def test_distance_is_to_segments_not_to_nodes():

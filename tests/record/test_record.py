@@ -173,6 +173,37 @@ def test_slow_frames_are_committed_by_the_clock(tmp_path):
     recorder.close()
 
 
+def test_a_record_that_is_closed_between_blocks(tmp_path):
+    """So many can be written that they can't all be open; only full blocks and flushes are committed."""
+    now = [0.0]
+    recorders = [
+        started(tmp_path / f"{k}.h5", block_frames=4, keep_open=False, clock=lambda: now[0]) for k in range(1200)
+    ]
+    for recorder in recorders:
+        recorder.write(frame(0))
+    first, second = recorders[:2]
+    for index in range(1, 7):
+        now[0] += 100.0
+        first.write(frame(index))
+    with Record(first.path) as record:
+        assert_holds_frames(record, range(5))
+    first.flush()
+    first.flush()
+    with Record(first.path) as record:
+        assert_holds_frames(record, range(7))
+    started(first.path, resume_step=10**9).close()  # it is not locked
+    for recorder in recorders:
+        recorder.close()
+    with pytest.raises(RecordError, match="exists already"):
+        first.write(frame(7))
+    resumed = started(second.path, resume_step=0, block_frames=4, keep_open=False)
+    for index in range(1, 6):
+        resumed.write(frame(index))
+    resumed.close()
+    with Record(second.path) as record:
+        assert_holds_frames(record, range(6))
+
+
 def test_everything_is_cut_to_the_commit_marker(tmp_path):
     """A writer that died between the values and `step` leaves longer datasets behind."""
     path = written(tmp_path / "run.h5", 12)

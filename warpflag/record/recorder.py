@@ -37,28 +37,38 @@ from warpflag.record.record import Record
 
 __all__ = ["Recorder"]
 
-_BLOCK_FRAMES = 10
 _BLOCK_SECONDS = 2.0
 
 
 class Recorder:
     """Reporter that writes run.h5: start, write frame by frame, flush, close.
 
-    Frames are committed in blocks of 10, or once 2 s have passed since the last block; the first frame at
-    once. After an exception (Ctrl-C) close() commits what is pending.
+    Frames are committed in blocks, or once 2 s have passed since the last block; the first frame at once. After an
+    exception (Ctrl-C) close() commits what is pending.
 
     Args:
         path: the file to write. It must not exist, unless `resume_step` is given.
         resume_step: continue an existing file: frames whose step is larger are cut off and new ones appended.
+        block_frames: frames of a block.
+        keep_open: whether the file stays open and locked between blocks. If not, only full blocks and calls of `flush`
+            are committed: thousands of records can then be written at once.
         clock: seconds that pass, for tests.
     """
 
     def __init__(
-        self, path: str | Path, *, resume_step: int | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        path: str | Path,
+        *,
+        resume_step: int | None = None,
+        block_frames: int = 10,
+        keep_open: bool = True,
+        clock: Callable[[], float] = time.monotonic,
     ):
         self.path = Path(path)
         self._resume_step = resume_step
+        self._block_frames, self._keep_open = block_frames, keep_open
         self._clock = clock
+        self._started = False  # the file is there, open or not
         self._file: Any = None
         self._disk: DiskFile | None = None
         self._parameters: dict[str, Any] = {}
@@ -121,7 +131,7 @@ class Recorder:
             DiskError: a block of frames could not be written; all committed before stay readable.
         """
         values = values_of(frame)
-        if self._file is None:
+        if not self._started:
             self._create(values)
             return
         shapes = {name: np.shape(value) for name, value in values.items()}
@@ -130,8 +140,8 @@ class Recorder:
             wrong = sorted(name for name, _ in shapes.items() ^ expected.items())
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
         self._pending.append(values)
-        late = self._clock() - self._last_commit > _BLOCK_SECONDS
-        if late or len(self._pending) >= _BLOCK_FRAMES:
+        late = self._keep_open and self._clock() - self._last_commit > _BLOCK_SECONDS
+        if late or len(self._pending) >= self._block_frames:
             self._commit()
 
     def flush(self) -> None:
@@ -140,9 +150,15 @@ class Recorder:
         Raises:
             DiskError: they could not be written; all committed before stay readable.
         """
+        if not self._started:
+            return
         self._commit()
-        if self._disk is not None:
-            self._disk.sync()
+        disk = self._disk or DiskFile(self.path)
+        try:
+            disk.sync()
+        finally:
+            if disk is not self._disk:
+                disk.close()
 
     def close(self) -> None:
         """Commits what is pending and closes the file; calling it again does nothing.
@@ -151,16 +167,18 @@ class Recorder:
             DiskError: what was pending could not be written; the file is closed, all committed before is readable.
         """
         try:
-            if self._file is not None:
-                self.flush()
+            self.flush()
         finally:
+            self._started = False
             self._release()
 
     def _commit(self) -> None:
         """Writes the pending frames and their checksums, flushes, and then writes `step`, the mark of the commit."""
         if not self._pending:
             return
-        assert self._disk is not None
+        if self._file is None:
+            self._open(DiskFile(self.path), list(self._shapes))
+        assert self._disk is not None and self._file is not None
         # Rows start at the committed count, not at a dataset's end: a commit that was interrupted is
         # repeated.
         count = self._committed + len(self._pending)
@@ -182,10 +200,12 @@ class Recorder:
         self._committed = count
         self._pending = []
         self._last_commit = self._clock()
+        if not self._keep_open:
+            self._release()
 
     def _abandon(self) -> None:
         """Closes HDF5's file after a write that failed; what it still writes goes nowhere, and can't fail again."""
-        self._pending = []
+        self._started, self._pending = False, []
         with contextlib.suppress(Exception):
             size = self._file.id.get_filesize()
             nowhere = os.open(os.devnull, os.O_RDWR)
@@ -235,7 +255,9 @@ class Recorder:
                 temporary.unlink()
             raise DiskError.of(self.path, error) from error
         self._open(DiskFile(self.path), [*values, CHECKSUMS])
-        self._committed, self._last_commit = 1, self._clock()
+        self._started, self._committed, self._last_commit = True, 1, self._clock()
+        if not self._keep_open:
+            self._release()
 
     def _reopen(self, resume_step: int) -> None:
         """Opens an existing file and cuts it to the frames with step <= resume_step."""
@@ -256,7 +278,9 @@ class Recorder:
         except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
             raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
-        self._last_commit = self._clock()
+        self._started, self._last_commit = True, self._clock()
+        if not self._keep_open:
+            self._release()
 
     def _open(self, disk: DiskFile, names: list[str]) -> None:
         """Opens the file for writing; `disk` holds its lock, so HDF5 needs none of its own."""
