@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from tests.attack.damage import damaged
 from tests.record.test_record import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.record import Record, RecordError
+from warpflag.record.layout import checksum
 
 FRAMES = 70  # more than a chunk of 64
 MUTATIONS = 300
@@ -88,14 +91,24 @@ def test_one_flipped_bit_of_a_frame_is_found_and_the_other_frames_stay_readable(
             record.frame(5)
 
 
-@pytest.mark.parametrize("text", [b'name = "two"', b"1.2.3"], ids=["scene", "version"])
-def test_a_changed_parameter_is_found(tmp_path, text):
+@pytest.mark.parametrize(
+    "stored",
+    [b'name = "two"', b"1.2.3", struct.pack("<d", 0.01), struct.pack("<d", 2.5), struct.pack("<3q", *FIRST_NODE)],
+    ids=["scene", "version", "radius", "length", "first node"],
+)
+def test_a_changed_parameter_is_found(tmp_path, stored):
     path = written(tmp_path / "run.h5", 3)
     sound = path.read_bytes()
-    assert sound.count(text) >= 1
-    place = sound.rindex(text) + len(text) - 1
+    place = sound.rindex(stored) + len(stored) // 2
     path.write_bytes(sound[:place] + bytes([sound[place] ^ 1]) + sound[place + 1 :])
     refusal(path)
+
+
+def test_checksums_are_those_of_the_stored_bytes():
+    """As another program would find them."""
+    assert checksum(np.array([[1.5], [-2.0]])) == zlib.crc32(struct.pack("<2d", 1.5, -2.0))
+    assert checksum(np.float64(0.1)) == zlib.crc32(struct.pack("<d", 0.1))
+    assert checksum(np.int64(2**40 + 1)) == zlib.crc32(struct.pack("<q", 2**40 + 1))
 
 
 def test_every_truncation_is_refused_in_one_line(tmp_path):

@@ -138,7 +138,7 @@ def test_the_space_reserved_is_enough_for_what_hdf5_takes_and_little_more(tmp_pa
         file.visititems(lambda _, item: datasets.append(item) if getattr(item, "chunks", None) else None)
         assert len(datasets) > 8
         count, reserved, start = 1, 0, file.id.get_filesize()
-        for _ in range(min(90, 9000 // block)):
+        for _ in range(min(75, 5000 // block)):
             present, expected = file.id.get_filesize(), growth(datasets, count, count + block)
             count += block
             for dataset in datasets:
