@@ -11,15 +11,12 @@ from typing import Any
 
 import pytest
 
-from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, with_values
-from warpflag.scene import scene as scene_module
+from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, sections, with_values
 from warpflag.scene.settings import Section
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
-SECTIONS = [
-    cls
-    for cls in vars(scene_module).values()
-    if isinstance(cls, type) and issubclass(cls, Section) and cls is not Section
+SECTIONS = [Scene] + [
+    cls for cls in vars(sections).values() if isinstance(cls, type) and issubclass(cls, Section) and cls is not Section
 ]
 SETTINGS = [(cls, name) for cls in SECTIONS for name in cls.settings]
 NUMERIC = [(cls, name) for cls, name in SETTINGS if cls.settings[name].kind in ("number", "integer")]
@@ -311,12 +308,12 @@ def test_with_values_checks_and_leaves_the_original(tmp_path):
 def test_a_written_scene_reads_back_equal(tmp_path):
     scene = Scene(
         "all the settings",
-        flagella=scene_module.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
+        flagella=sections.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
         flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(0.1)),
-        fluid=scene_module.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
-        hydrodynamics=scene_module.Hydrodynamics("within", 0.02),
-        numerics=scene_module.Numerics("euler", 1e-9 / 7, "float32", 1e-3),
-        start=scene_module.Start('a "quoted" \\ path\t\x7f é', 3),
+        fluid=sections.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
+        hydrodynamics=sections.Hydrodynamics("within", 0.02),
+        numerics=sections.Numerics("euler", 1e-9 / 7, "float32", 1e-3),
+        start=sections.Start('a "quoted" \\ path\t\x7f é', 3),
     )
     assert scene_from(tmp_path, dumps(scene)) == scene
 
