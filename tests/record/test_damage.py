@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.attack.damage import damaged
-from tests.record.test_record import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
+from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.record import Record, RecordError
 from warpflag.record.layout import checksum
 

@@ -12,7 +12,7 @@ from typing import Any
 import h5py  # noqa: TID253 (no command line starts here)
 import pytest
 
-from tests.record.test_record import FIRST_NODE, assert_holds_frames, frame, started, written
+from tests.record.frames import FIRST_NODE, assert_holds_frames, frame, started, written
 from warpflag.base.output import DiskError
 from warpflag.record import Record, RecordError
 from warpflag.record.new_record import FORMAT, growth
@@ -25,7 +25,7 @@ FRAMES = 150
 WRITER = """
 import resource, sys
 from pathlib import Path
-from tests.record.test_record import frame, started
+from tests.record.frames import frame, started
 path, limit, frames = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 recorder = started(path)
