@@ -53,6 +53,23 @@ def test_progress_goes_on_in_silence_where_its_stream_is_broken(broken):
     let_go(stream)
 
 
+def test_progress_tries_a_broken_stream_once():
+    class Broken(io.StringIO):
+        tried = 0
+
+        def write(self, text):
+            self.tried += 1
+            raise BrokenPipeError
+
+    stream, now = Broken(), [0.0]
+    progress = Progress(1e-3, stream, clock=lambda: now[0])
+    for step in range(8):
+        now[0] += 100.0
+        progress.update(1e-4 * step)
+    progress.close()
+    assert stream.tried == 1
+
+
 def test_what_a_stream_can_not_encode_is_escaped():
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding="ascii", errors="strict")
@@ -89,9 +106,10 @@ from warpflag.base.streams import protected_streams
 def command():
     with open({path!r}, "w") as end:
         assert end.fileno() > 2, "takes the place of a standard stream"
-        for _ in range(20):
+        for _ in range({lines}):
             print("µ" * 10_000)
             print("µ" * 10_000, file=sys.stderr, flush=True)
+        print("last")  # not before the process ends
         os.write(2, b"as a library of another language does")
         end.write("reached the end")
     return 5
@@ -107,9 +125,10 @@ sys.exit(command())
         *("2>&1 | head -c 3", "| true", ">/dev/null 2>/dev/null"),
     ],
 )
-def test_a_command_prints_to_broken_streams_and_keeps_its_status(tmp_path, redirection):
+@pytest.mark.parametrize("lines", [0, 20])
+def test_a_command_prints_to_broken_streams_and_keeps_its_status(tmp_path, redirection, lines):
     script, end = tmp_path / "script.py", tmp_path / "end"
-    script.write_text(COMMAND.format(path=str(end)))
+    script.write_text(COMMAND.format(path=str(end), lines=lines))
     shell = f"PYTHONIOENCODING=ascii '{sys.executable}' '{script}' {redirection}; exit ${{PIPESTATUS[0]}}"
     done = subprocess.run(
         ["bash", "-c", shell], cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=60
