@@ -130,7 +130,9 @@ sys.exit(command())
 def test_a_command_prints_to_broken_streams_and_keeps_its_status(tmp_path, redirection, lines):
     script, end = tmp_path / "script.py", tmp_path / "end"
     script.write_text(COMMAND.format(path=str(end), lines=lines))
-    shell = f"PYTHONIOENCODING=ascii '{sys.executable}' '{script}' {redirection}; exit ${{PIPESTATUS[0]}}"
+    shell = (
+        f"PYTHONIOENCODING=ascii PYTHONUNBUFFERED= '{sys.executable}' '{script}' {redirection}; exit ${{PIPESTATUS[0]}}"
+    )
     done = subprocess.run(
         ["bash", "-c", shell], cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=60
     )
