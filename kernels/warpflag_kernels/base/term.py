@@ -59,7 +59,7 @@ def variant(terms: Sequence[Term]) -> str:
 @functools.cache
 def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     """Device functions of several terms together, in their order: those of `Term.functions`, each one function that
-    adds what all terms have to say; but `in_cell` and `in_flagellum`, which stay lists."""
+    adds up all terms; but `in_cell` and `in_flagellum`, which stay lists."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     module = p.module("terms", variant(terms))

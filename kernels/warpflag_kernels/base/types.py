@@ -125,7 +125,7 @@ def structs(p: Precision) -> SimpleNamespace:
         steric_second: wp.array(dtype=vec3)  # [E] [pN]
         body_contact: wp.array(dtype=vec3)  # [E] [pN]
         # Totals.
-        force: wp.array(dtype=vec3)  # [E]; on r_0: what the anchor hands to the body [pN]
+        force: wp.array(dtype=vec3)  # [E]; on r_0: force of the flagellum on the body at the anchor [pN]
         spin_torque: wp.array(dtype=real)  # [E], about the tangent [pN um]
         velocity: wp.array(dtype=vec3)  # [E], of the node, lab [um/s]
         flagellum_force: wp.array(dtype=vec3)  # [K], of a flagellum on the body [pN]

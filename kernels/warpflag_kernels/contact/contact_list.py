@@ -101,8 +101,8 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def segment_loads(contacts_in: Contacts, magnitude: wp.array(dtype=real), e: wp.int32):
-        """Contact forces on the first and second node of segment e >= 1; the second also takes its node's with the
-        body."""
+        """Contact forces on the first and second node of segment e >= 1; a contact of node e with the body acts on the
+        second."""
         on_first = vec3(real(0.0))
         on_second = vec3(real(0.0))
         i = contacts_in.start[e]

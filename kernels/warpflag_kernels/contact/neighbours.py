@@ -97,7 +97,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def first_later(model: Model, near: Neighbours, e: wp.int32):
-        """From which candidate on they are of later flagella."""
+        """Index of the first candidate of a later flagellum."""
         if near.count[e] >= 0:
             return near.earlier[e]
         return model.first_node[model.flagellum_of[e] + 1] - model.first_node[model.first_flagellum[model.cell_of[e]]]
@@ -108,7 +108,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def next_near(longest: real, j: wp.int32, distance: real, reach: real):
-        """The next segment of a flagellum that can be near: along it, midpoints move on by no more than the lengths.
+        """The next segment after j that can be near: neighbouring midpoints are at most a segment's length apart.
 
         Args:
             longest: length of its longest segment [um].

@@ -1,6 +1,6 @@
 """The steric law and where two segments, or a node and the body, are closest.
 
-The paper's truncated Lennard-Jones force (eq. 8), F(r) = F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, r the
+The paper's truncated Lennard-Jones force, F(r) = F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, r the
 minimal distance of the two centre lines (for the body: of the node from the surface). Below 0.7 sigma it continues
 along its tangent there, so that a deep overlap still pushes back with a finite force.
 """
@@ -79,8 +79,8 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def direction(gap: vec3, r: real, d1: vec3, d2: vec3, diameter: real):
-        """Of the force on the first of two segments along d1 and d2, across a gap of length r."""
-        # Centre lines that touch exactly have no direction of their own: part them across both.
+        """Direction of the force on the first of two segments along d1 and d2; gap: vector of length r."""
+        # Centre lines that touch exactly have no direction: they are pushed apart across both.
         normal = gap / r
         if r <= touching * diameter:
             normal = wp.normalize(wp.cross(d1, d2))  # changes sign with the side

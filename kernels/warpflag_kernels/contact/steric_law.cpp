@@ -1,5 +1,5 @@
-// The steric force and its stiffness -dF/dr at distance r. Without branches, so that loops over it can be vector code, and
-// so that it says NaN to NaN.
+// The steric force and its stiffness -dF/dr at distance r. Without branches, so that loops over it can be vectorised; NaN
+// gives NaN.
 const auto law = [](REAL r, REAL strength, REAL diameter, REAL& force, REAL& stiffness) {
     const REAL x = r / diameter, below = (REAL)LINEAR - x;
     const REAL y = 1 / (below > 0 ? (REAL)LINEAR : x), y2 = y * y, y6 = y2 * y2 * y2;

@@ -1,6 +1,6 @@
-"""The cell body: sums what the flagella hand to it and moves by the mobility of a prolate spheroid.
+"""The cell body: sums the forces and torques of the flagella on it and moves by the mobility of a prolate spheroid.
 
-Each flagellum hands over the force at its anchor, with its torque about the body's centre, and what the terms put on
+Each flagellum exerts the force at its anchor, with its torque about the body's centre, and what the terms put on
 the body directly: the motor's reaction, the bearing torque, the reaction to the contact of its nodes with the surface.
 """
 
@@ -34,7 +34,7 @@ def mobility(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
-    """Device functions: what one flagellum hands to the body, and the motion of one body."""
+    """Device functions: force and torque of one flagellum on the body, and the velocities of one body."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     on_body, respond = combined(p, terms).on_body, mobility(p).respond
@@ -98,7 +98,7 @@ def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
 
 
 def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
-    """Force [pN] and torque about the body's centre [pN um] that every flagellum hands to its body, of these terms."""
+    """Force [pN] and torque about the body's centre [pN um] of every flagellum on its body, of these terms."""
     kernel = _kernels(model.precision, terms).sum_flagella
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
 

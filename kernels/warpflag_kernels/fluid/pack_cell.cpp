@@ -1,4 +1,4 @@
-// Nodes [begin, end) laid out component by component for the symmetric sum, which begins at zero.
+// Copies nodes [begin, end) into one array per component, and sets their sums to zero.
 const RUN* __restrict__ P = reinterpret_cast<const RUN*>(position.data);
 const RUN* __restrict__ Q = reinterpret_cast<const RUN*>(force.data);
 REAL* __restrict__ X = s.x.data; REAL* __restrict__ Y = s.y.data; REAL* __restrict__ Z = s.z.data;

@@ -39,7 +39,7 @@ def types(p: Precision) -> SimpleNamespace:
         diagonal: wp.array(dtype=mat44)
         lower1: wp.array(dtype=mat44)
         lower2: wp.array(dtype=mat44)
-        # D^-1 of a node [E]: the tangent there, drag across it and what more there is along it [pN s/um].
+        # D^-1 of a node [E]: the tangent there, drag across it, and drag along it minus that across [pN s/um].
         tangent: wp.array(dtype=p.vec3)
         drag_across: wp.array(dtype=real)
         drag_excess: wp.array(dtype=real)

@@ -1,7 +1,7 @@
 """Block Cholesky factors of the band of one flagellum, and solutions with them: a thread to a flagellum or a column.
 
 Row i has the blocks `diagonal`, to itself, `lower1`, to row i - 1, and `lower2`, to row i - 2. Their factors take their
-place: C_ii^-1, C_(i,i-1), C_(i,i-2). `band_lanes` does the same for several flagella at once.
+place: C_ii^-1, C_(i,i-1), C_(i,i-2). `block_band_simd` does the same for several flagella at once.
 """
 
 import functools
@@ -127,7 +127,7 @@ def functions(p: Precision) -> SimpleNamespace:
             y1 = y
             i -= 1
 
-    # An index that is only known at run time would put a loaded block on the stack, in Warp's own words.
+    # Warp would copy the whole block to the stack to index it with a run-time index.
     @wp.func_native("return blocks.data[i].data[row][column];")
     def component(blocks: wp.array(dtype=mat46), i: wp.int32, row: wp.int32, column: wp.int32) -> real: ...
 
@@ -155,7 +155,7 @@ def functions(p: Precision) -> SimpleNamespace:
     ):
         """The solution for one column, which has right-hand sides in the first three rows alone: from right[at] on.
 
-        All six columns in one thread fill the registers of a GPU beyond the brim.
+        All six columns in one thread would spill the registers of a GPU.
         """
         y1 = vec4(real(0.0))
         y2 = vec4(real(0.0))

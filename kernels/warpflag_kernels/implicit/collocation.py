@@ -41,9 +41,10 @@ from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
 # Collocation point of a step that does not end at an output time, as a fraction of the step. The truncation error
-# falls with it as 3 theta^2 - 1; below 0.8 the stiff stretch of K x 100 gave indefinite matrices (docs/numerics.md).
+# falls with it as 3 theta^2 - 1, but stiff modes are damped less: by 0.67 a step at 0.8, by 0.84 at 0.75
+# (docs/numerics.md).
 THETA = 0.8
-# Largest node error of a step over the mean predictor error of the cell's nodes, for theta = 1. The mean is controlled,
+# Error estimate over the mean predictor error of a cell's nodes, for theta = 1; measured. The mean is controlled,
 # since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
 ERROR_PER_PREDICTOR = 7.0
 GAP_SHARE = 0.35  # residual of the gaps that the contact solve may leave, over the error that a step may make
@@ -69,10 +70,8 @@ def struct(p: Precision) -> Any:
         curvature: wp.array(dtype=wp.float64)  # factor of the second difference of earlier increments in predicted e
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
         one: wp.array(dtype=wp.float64)  # 1, the scale of a retraction by a whole increment
-        predictor_error: wp.array(
-            dtype=real
-        )  # [K], lengths of what was wrong with a flagellum's prediction, their sum [um]
-        predicted_displacement: wp.array(dtype=real)  # [K], lengths of what was predicted for them, summed up [um]
+        predictor_error: wp.array(dtype=real)  # [K], predictor error: sum over the nodes of |e - predicted e| [um]
+        predicted_displacement: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e| [um]
         trust: wp.array(dtype=wp.float64)  # 1 less the predictor error of the last step over its prediction, at least 0
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far

@@ -29,7 +29,7 @@ from warpflag_kernels.implicit.delassus import meet, struct
 from warpflag_kernels.rod import chain_chart
 
 ITERATIONS = 60  # at most; crowds take some ten
-FINEST = 1.0e-6  # least tolerance of a gap [sigma]; below, float32 flows make the residual noise
+FINEST = 1.0e-6  # least tolerance of a gap [sigma]; below, the residual is round-off of the float32 flows
 # Diagonal compliance over that of the nodes' local drag alone: elasticity and neighbours hold a node as well.
 DIAGONAL_PER_DRAG = 0.25
 DEEP = 0.75  # below this gap a solution starts from the contact's own scalar equation [sigma]
@@ -105,7 +105,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         thread: wp.int32,
         x: Increment,
     ):
-        """Applies W to what the forces at the solved gaps differ by from those applied so far.
+        """Applies W to the difference of the forces at the solved gaps from those applied so far.
 
         Returns the largest residual, and the square of that difference.
         """

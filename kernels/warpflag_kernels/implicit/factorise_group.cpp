@@ -20,7 +20,7 @@ for (int i = rows - 1; i >= 0; --i) {
             if (i + 1 > last[l]) c1[r][c][l] = 0;
             if (i + 2 > last[l]) c2[r][c][l] = 0;
         }
-    for (int r = 0; r < 4; ++r) {  // every row of c1 and c2 from its end: what is still needed stands before
+    for (int r = 0; r < 4; ++r) {  // every row of c1 and c2 from its end, in place
         for (int c = 3; c >= 0; --c) {
             V sum = c2[r][c] * inverse2[c][c];
             for (int m = 0; m < c; ++m) sum += c2[r][m] * inverse2[c][m];

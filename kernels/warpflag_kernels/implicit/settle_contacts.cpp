@@ -1,5 +1,5 @@
 // New gaps from the scalar equations gap - d F(gap) = c of every contact, d the diagonal compliance. Their left sides are
-// concave: Newton's method overshoots from above once, from below it rises to the solution.
+// concave: Newton's method overshoots once from above; from below it rises to the solution.
 LAW
 REAL* __restrict__ G = law_in.solved_gap.data;
 const REAL* __restrict__ A = law_in.applied.data; const REAL* __restrict__ F = law_in.force.data;

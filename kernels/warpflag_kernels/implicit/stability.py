@@ -169,7 +169,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
     """Which cells are measured in this pass, into `measured` and `due`.
 
-    Those are the cells of three flagella or more, every few steps, and whenever a step has been refused.
+    Those are the cells of three flagella or more, every few steps, and whenever a step has been rejected.
 
     Args:
         model, state: of the batch.

@@ -63,7 +63,7 @@ def rows(p: Precision) -> Any:
 @functools.cache
 def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNamespace:
     """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
-    `spread` where pairs are taken once, then `flow_at` any node; for one form of the sum, see `form_of`. Lanes: threads
+    `spread` where pairs are taken once, then `flow_at` any node; for one `Plan.step_pairs`. Threads: those
     that share what is gathered at a node, one or those of a warp."""
     real, vec3, single = p.real, p.vec3, p.single
     Model, Flow = structs(p).Model, struct(p)
@@ -302,7 +302,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
-    """Places, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
+    """Slots, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
     kernels, device = _kernels(model.precision, contacts_in is not None), model.device
     listed = contact_list.struct(model.precision)() if contacts_in is None else contacts_in
     inputs = [model.data, state.data, listed, flow]

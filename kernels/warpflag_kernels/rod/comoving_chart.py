@@ -176,8 +176,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = model.cell_of[first]
         if state.active[c] == 0 or chart.rest[c] == 0:
             return
-        # Least squares over node velocities relative to the anchor. Spins count little: a straight rod needs them to be
-        # regular, but while they relax they are no rotation of the flagellum and would spoil the fit.
+        # Least squares over node velocities relative to the anchor. Spins have a small weight: it keeps
+        # the system regular for a straight rod, while spins that only relax do not distort the fit.
         weight = real(0.01) * model.rod.segment_length[k] * model.rod.segment_length[k]
         matrix = mat33(real(0.0))
         moment = vec3(real(0.0))

@@ -4,7 +4,7 @@ Joint i couples segments i and i + 1 with tangents t, u and strain h Omega = (w1
 
     E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|e|/h - 1)^2
 
-(the paper's Kirchhoff density, eq. 4; its stretching term has no rest length as printed, here it has one). The motor
+(the paper's Kirchhoff density; its stretching term has no rest length as printed, here it has one). The motor
 joint 0 is a universal joint: no bending rigidity, no intrinsic twist, `hook_rigidity` in place of C. Directors follow
 a moving tangent by the minimal rotation, so gradients are taken with respect to segment vectors and spin angles.
 

@@ -124,8 +124,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         along_second = (half * c3) * kb - (half * wp.dot(kb, rb)) * tm
         sm = (se + sf) / chi
         both = (c3 * quarter) * wp.outer(kb, kb) + (real(2.0) * big_w) * wp.outer(tm, tm)
-        # Gradients of w1, w2 with respect to e, times the segment's length; what is known is written at once, since
-        # all the results together would not fit into the registers of a GPU.
+        # Gradients of w1, w2 with respect to e, times the segment's length; each result is stored as soon as it
+        # is known, since all of them together would not fit into the registers of a GPU.
         g1e = wp.cross(u, d1) - w1 * tm
         g2e = wp.cross(u, d2) - w2 * tm
         us = wp.cross(u, sm)

@@ -1,4 +1,4 @@
-"""Reconstruction of the pose from a chart's increments: bodies, anchors, nodes, and the frames between nodes."""
+"""Reconstruction of the pose from a chart's increments: bodies, anchors, nodes, tangents and directors."""
 
 import functools
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from warpflag_kernels.rod import rotations
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions of one body, the anchor of one flagellum, one node, and one frame."""
+    """Device functions of one body, the anchor of one flagellum, one node, one segment."""
     real, vec3 = p.real, p.vec3
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     f, fd = rotations.functions(p), rotations.functions(p.double)

@@ -8,7 +8,7 @@ import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 
-# atan x = x + x^3 P(x^2) below tan(pi/8), the minimax polynomial to a relative error of 4e-17.
+# atan x = x + x^3 P(x^2) for |x| < tan(pi/8): coefficients of the minimax polynomial P, relative error 4e-17.
 _ARCTANGENT = (
     -0.3333333333333015, 0.19999999999088933, -0.14285714195260032, 0.11111106653551665, -0.09090782411894727,
     0.07690068294887187, -0.0664112115510828, 0.056925388380342015, -0.04359094867624417, 0.02125983999894584,
@@ -52,7 +52,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def angle(s: real, c: real):
-        """atan2(s, c); up to an eighth of a turn twice that of the half angle, several times cheaper, to round-off."""
+        """atan2(s, c); below 45 degrees by half angles and a polynomial, several times cheaper, to round-off."""
         if wp.static(p.strict) or wp.abs(s) > c:
             return wp.atan2(s, c)
         x = s / (c + wp.sqrt(s * s + c * c))
@@ -80,7 +80,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
-        """That angle [rad]."""
+        """Angle from a1, transported from t onto u, to b1 [rad]."""
         s, c = twist(t, u, a1, b1)
         return wp.atan2(s, c)
 

@@ -218,7 +218,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         reach = within + real(2.0) * moved
         if not (wp.dot(away, away) < reach * reach):
             return False
-        # No point of one has moved further against a point of the other than their ends have.
+        # The relative displacement of two points of the segments is at most that of their ends.
         p1n, q1n, p2n, q2n = (
             state.pose.position[e - 1],
             state.pose.position[e],

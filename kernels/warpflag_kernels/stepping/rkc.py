@@ -30,14 +30,15 @@ from warpflag_kernels.stepping.step_control import StepControl
 
 DAMPING = 2.0 / 13.0  # of the stability polynomial, as in the paper above
 STAGE_FACTOR = 1.54  # stages: 1 + (1 + 1.54 dt spectral radius)^1/2, as in the paper above
-# Norm of the probe, spins in rad, displacements in segment lengths: about the root of the precision, at which
-# truncation and round-off of a difference are alike.
+# Norm of the probe, spins in rad, displacements in segment lengths: well above the root of
+# the unit round-off, at which truncation and round-off of a difference are alike; measured (docs/numerics.md).
 PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
 EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last place of 1
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 SAFETY = 1.15
 FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
-# The embedded estimate (0.8 and 0.4 in the paper above) exceeds the errors found in runs ten to fifty times.
+# Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.01 to 0.8 of
+# what the accuracy allows (docs/numerics.md).
 ESTIMATE_SHARE = 0.1
 NOISE = 20.0  # an estimate below this times its usual round-off is taken to be round-off
 MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unstable, and the guards stop the cell
@@ -102,9 +103,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     damping = wp.constant(wp.float64(DAMPING))
     probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
     safety = wp.constant(wp.float64(SAFETY))
-    rate_weight = wp.constant(real(round(0.4 * ESTIMATE_SHARE, 12)))
-    increment_weight = wp.constant(real(round(0.8 * ESTIMATE_SHARE, 12)))
-    noise_weight = wp.constant(real(round(0.4 * ESTIMATE_SHARE, 12) * NOISE))
+    weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
+    rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
     stage_factor = wp.constant(wp.float64(STAGE_FACTOR))
     epsilon = wp.constant(real(EPSILON[p.name]))
     most_stages = wp.constant(wp.float64(MOST_STAGES))

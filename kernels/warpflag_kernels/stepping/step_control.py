@@ -19,8 +19,8 @@ import warp as wp
 from warpflag_kernels.base.clock import STEP_TOLERANCE
 from warpflag_kernels.base.precision import Precision
 
-SPAN = 1.0e-3  # time over which independent errors add up to what may be made in it: 1 ms, the unit of accuracy [s]
-# Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41; the rest is left to the other stages.
+SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
+# Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41.
 LARGEST_GROWTH = 2.0
 REJECTED = 25.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
 SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
