@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py  # noqa: TID253 (no command line starts here)
@@ -51,6 +52,21 @@ def test_another_process_reads_while_a_run_writes(tmp_path):
             process.stdin.write("on\n")
             process.stdin.flush()
         process.kill()
+
+
+def test_a_record_opens_at_any_moment_of_a_run_that_writes_without_pause(tmp_path):
+    path = tmp_path / "run.h5"
+    with start_writer(path, wait=False) as process, ThreadPoolExecutor(1) as pool:
+        assert process.stdout is not None
+        process.stdout.readline()
+        said = pool.submit(process.stdout.read)  # or the writer would wait for its reader
+        counts = []
+        for _ in range(60):
+            with Record(path) as record:
+                counts.append(record.frame_count)
+        process.kill()
+        said.result()
+    assert counts == sorted(counts) and counts[-1] > counts[0]
 
 
 @pytest.mark.parametrize("blocks", [1, 2, 7, 40, 90])

@@ -6,9 +6,7 @@ checksums as they are read. Records of versions that wrote no checksums are read
 
 from __future__ import annotations
 
-import hashlib
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +17,16 @@ from warpflag.record.frame_array import FrameArray, reading
 from warpflag.record.layout import (
     BODY_ORIENTATION,
     BODY_POSITION,
-    CHECKSUMS,
     E1,
     ENTRIES,
     MOTOR_ANGLE,
-    PARAMETERS,
     POSITION,
     RECORD_NAME,
     Frame,
     RecordError,
     dataset_path,
-    parameters_checksum,
-    summed_entries,
-    text_of,
 )
+from warpflag.record.opening import OpenRecord, open_record
 
 __all__ = ["Record"]
 
@@ -67,83 +61,40 @@ class Record:
     def close(self) -> None:
         """Closes the file, if it was opened."""
         self._arrays.clear()
-        if "_file" in self.__dict__:
+        if "_opened" in self.__dict__:
             with reading(self.path, "can't be closed"):
-                self.__dict__.pop("_file").close()
+                self.__dict__.pop("_opened").file.close()
 
     @cached_property
-    def _file(self) -> Any:
-        import h5py
+    def _opened(self) -> OpenRecord:
+        return open_record(self.path)
 
-        with reading(self.path, "not a readable HDF5 file"):
-            try:
-                # Without a lock, or a run that is still writing would keep its readers out.
-                file = h5py.File(self.path, "r", locking=False)
-            except OSError as error:
-                # A file that this process has open with a lock can't be opened without.
-                if "locking" not in str(error):
-                    raise
-                file = h5py.File(self.path, "r")
-        with reading(self.path, "is damaged"):
-            missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
-            if missing:
-                file.close()
-                raise RecordError(f"{self.path}: not a record of warpflag, it has no /{missing[0]}")
-        return file
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Names of what is kept frame by frame: step, time, the entries, the observables, and checksums if any."""
+        return self._opened.entries
 
-    @cached_property
-    def entries(self) -> list[str]:
-        """Names of what is kept frame by frame: step, time, the entries, the observables, and checksums if it has any.
-
-        Their shapes are compared with each other and with the flagella when they are first looked at.
-        """
-        with reading(self.path, "is damaged"):
-            observables = [f"observables/{name}" for name in self._file.get("observables", ())]
-            names = ["step", "time", *ENTRIES, *observables]
-            nodes, flagella = int(self.first_node[-1]), len(self.first_node) - 1
-            shapes = {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,)}
-            shapes |= {BODY_POSITION: (3,), BODY_ORIENTATION: (4,), "step": (), "time": ()}
-            frames = len(self._file[dataset_path("step")])
-            size = self.path.stat().st_size
-            for name in names:
-                dataset = self._file[dataset_path(name)]
-                allowed = [shapes[name]] if name in shapes else [(), (flagella,)]
-                fits = dataset.shape[1:] in allowed and dataset.dtype.kind == ("i" if name == "step" else "f")
-                if not fits or len(dataset) < frames or frames * dataset.dtype.itemsize > size:
-                    problem = f"/{dataset_path(name)} has the shape {dataset.shape}, type {dataset.dtype}"
-                    raise RecordError(f"{self.path}: is damaged: {problem} beside {frames} frames, {nodes} nodes")
-            if CHECKSUMS in self._file:
-                self._check_checksums(names, frames)
-                names.append(CHECKSUMS)
-        return names
-
-    def _check_checksums(self, names: list[str], frames: int) -> None:
-        sums = self._file[CHECKSUMS]
-        listed = summed_entries(sums)
-        if sorted(listed) != sorted(names) or sums.shape[1:] != (len(names),) or len(sums) < frames:
-            raise RecordError(f"{self.path}: is damaged: /{CHECKSUMS} does not list the entries of the record")
-
-    @cached_property
+    @property
     def frame_count(self) -> int:
-        """Number of committed frames when the record was first looked at."""
-        with reading(self.path, "is damaged"):
-            return len(self._file[dataset_path(self.entries[0])])
+        """Number of committed frames when the record was opened."""
+        return self._opened.frame_count
 
-    @cached_property
-    def _sums(self) -> dict[str, NDArray[np.uint32]]:
-        """Checksums of the committed frames by entry, shape [frame_count]; empty for a record without."""
-        if CHECKSUMS not in self.entries:
-            return {}
-        with reading(self.path, "checksums can't be read"):
-            sums = self._file[CHECKSUMS]
-            return dict(zip(summed_entries(sums), sums[: self.frame_count].T, strict=True))
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """What /parameters holds: scene, scene_sha256, first_node, filament_radius, body_length, body_width, versions.
+
+        Lengths in um; first_node has the shape [flagellum_count + 1], versions maps names to versions.
+        """
+        return self._opened.parameters
 
     def _frames(self, name: str) -> FrameArray:
         """The frames of one entry; kept, because HDF5 forgets the chunks of a dataset that is opened anew."""
         if name not in self._arrays:
-            count, sums = self.frame_count, self._sums.get(name)
+            opened = self._opened
             with reading(self.path, "frames can't be read"):
-                self._arrays[name] = FrameArray(self._file[dataset_path(name)], sums, count, self.path, name)
+                dataset = opened.file[dataset_path(name)]
+                array = FrameArray(dataset, opened.sums.get(name), opened.frame_count, self.path, name)
+            self._arrays[name] = array
         return self._arrays[name]
 
     @property
@@ -190,29 +141,6 @@ class Record:
     def _observable_names(self) -> list[str]:
         prefix = "observables/"
         return [name.removeprefix(prefix) for name in self.entries if name.startswith(prefix)]
-
-    @cached_property
-    def parameters(self) -> dict[str, Any]:
-        """What /parameters holds: scene, scene_sha256, first_node, filament_radius, body_length, body_width, versions.
-
-        Lengths in um; first_node has the shape [flagellum_count + 1], versions maps names to versions.
-        """
-        with reading(self.path, "is damaged: /parameters can't be read"):
-            group = self._file["parameters"]
-            if any(np.prod(group[name].shape, dtype=int) > self.path.stat().st_size for name in PARAMETERS):
-                raise RecordError(f"{self.path}: is damaged: /parameters is larger than the file")
-            found = {name: group[name][()] for name in PARAMETERS}
-            found |= {name: text_of(found[name]) for name in ("scene", "scene_sha256")}
-            found |= {name: float(found[name]) for name in ("filament_radius", "body_length", "body_width")}
-            found["first_node"] = np.asarray(found["first_node"]).astype(np.int64)
-            found["versions"] = {name: text_of(value) for name, value in group["versions"].attrs.items()}
-            expected = group.attrs.get("checksum")
-            sound = expected is None or int(expected) == parameters_checksum(found)
-            sound = sound and hashlib.sha256(found["scene"].encode()).hexdigest() == found["scene_sha256"]
-            bounds = found["first_node"].tolist()
-            if not sound or len(bounds) < 2 or bounds[0] != 0 or any(b - a < 2 for a, b in pairwise(bounds)):
-                raise RecordError(f"{self.path}: is damaged: /parameters does not agree with its checksum")
-        return found
 
     @property
     def first_node(self) -> NDArray[np.int64]:

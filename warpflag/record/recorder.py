@@ -266,7 +266,7 @@ class Recorder:
             if not np.array_equal(present["first_node"], self._parameters["first_node"]):
                 raise RecordError(f"{self.path}: has other flagella than the run that would continue it")
             self._committed = int(np.searchsorted(record.steps, resume_step, side="right"))
-            names = record.entries
+            names = list(record.entries)
         disk = DiskFile(self.path)
         if parameters_checksum(present) != parameters_checksum(self._parameters):
             disk = self._with_new_parameters(disk)
