@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 import signal
@@ -132,6 +133,17 @@ def test_resume_keeps_the_frame_of_its_step(tmp_path):
     started(path, resume_step=100).close()
     with Record(path) as record:
         assert_holds_frames(record, range(11))
+
+
+def test_resume_takes_observables_in_any_order(tmp_path):
+    path = written(tmp_path / "run.h5", 25)
+    recorder = started(path, resume_step=100)
+    for index in range(11, 25):
+        own = frame(index)
+        recorder.write(dataclasses.replace(own, observables=dict(reversed(own.observables.items()))))
+    recorder.close()
+    with Record(path) as record:
+        assert_holds_frames(record, range(25))
 
 
 def test_resume_needs_a_record_of_the_same_flagella(tmp_path):
