@@ -309,7 +309,7 @@ def test_a_written_scene_reads_back_equal(tmp_path):
     scene = Scene(
         "all the settings",
         flagella=sections.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
-        flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(0.1)),
+        flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(60.1)),
         fluid=sections.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
         hydrodynamics=sections.Hydrodynamics("within", 0.02),
         numerics=sections.Numerics("euler", 1e-9 / 7, "float32", 1e-3),

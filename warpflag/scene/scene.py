@@ -7,6 +7,7 @@ degrees. `warpflag.scene.reading` makes scenes of files and of other scenes.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -147,7 +148,6 @@ class Scene(Section, key=""):
             with problems.gathered():
                 raise SceneError("flagella.count", self.flagella.count, problem)
             return
-        anchors: dict[tuple[float, float], int] = {}
         told: set[str | None] = set()  # a value of the group is at fault once, not for every flagellum
         for k, spec in enumerate(self.resolved_flagella()):
             if problems.full():
@@ -160,11 +160,37 @@ class Scene(Section, key=""):
                         told.add(error.key)
                         with problems.gathered():
                             raise
-            place = (round(spec.azimuth % 360.0, 9), spec.anchor_offset)
-            if self.steric.enabled and anchors.setdefault(place, k) != k:
-                problem = f"puts flagellum {k} on the anchor of flagellum {anchors[place]}"
-                with problems.gathered():
-                    raise SceneError(f"flagellum.{k}.azimuth", spec.azimuth, problem)
+        if self.steric.enabled:
+            with problems.gathered():
+                self._check_distances()
+
+    def _check_distances(self) -> None:
+        """Two anchors nearer than a filament is thick have flagella inside each other, which no step can part."""
+        thick, radius = 2 * self.flagella.filament_radius, self.body.width / 2
+        boxes: dict[tuple[int, ...], list[int]] = {}  # flagella by the box of that size that their anchor is in
+        anchors: list[tuple[float, float, float]] = []
+        for k, spec in enumerate(self.resolved_flagella()):
+            around = math.radians(spec.azimuth)
+            anchors.append((radius * math.cos(around), radius * math.sin(around), spec.anchor_offset))
+            box = tuple(math.floor(x / thick) for x in anchors[k])
+            for step in itertools.product((-1, 0, 1), repeat=3):
+                for j in boxes.get((box[0] + step[0], box[1] + step[1], box[2] + step[2]), ()):
+                    self._check_distance(j, k, math.dist(anchors[j], anchors[k]), thick)
+            boxes.setdefault(box, []).append(k)
+
+    def _check_distance(self, j: int, k: int, distance: float, thick: float) -> None:
+        if distance >= thick * (1 - 1e-9):
+            return
+        if distance < 1e-9:
+            problem = f"puts flagellum {k} on the anchor of flagellum {j}"
+        else:
+            problem = (
+                f"puts the anchors of flagella {j} and {k} {distance:.3g} um apart, nearer than a filament is thick, "
+                f"{thick:.3g} um"
+            )
+        if self.flagellum and self.flagellum[k] != FlagellumOverride():
+            raise SceneError(f"flagellum.{k}.azimuth", self.resolved_flagella()[k].azimuth, problem)
+        raise SceneError("flagella.count", self.flagella.count, problem, ["body.width", "flagella.filament_radius"])
 
     def _check_segments(self, k: int, spec: FlagellumSpec) -> None:
         key, value = "flagella.segment_length", self.flagella.segment_length
