@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(message: object, status: int) -> int:
-    print(f"warpflag: {message}", file=sys.stderr)
+    print("\n".join(f"warpflag: {line}" for line in str(message).splitlines()), file=sys.stderr)
     return status
 
 

@@ -148,3 +148,70 @@ def test_the_space_reserved_is_enough_for_what_hdf5_takes_and_little_more(tmp_pa
             assert file.id.get_filesize() <= present + expected
             reserved += expected - 4096
         assert reserved < 1.5 * (file.id.get_filesize() - start) + 1e6
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="no such system call here")
+def test_space_found_in_part_is_given_back(tmp_path, monkeypatch):
+    path = written(tmp_path / "run.h5", 64)  # a full chunk
+    size = path.stat().st_size
+
+    def half(descriptor, start, count):
+        os.ftruncate(descriptor, start + count // 2)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", half)
+    recorder = started(path, resume_step=10**9)
+    recorder.write(frame(64))
+    with pytest.raises(DiskError):
+        recorder.flush()
+    assert path.stat().st_size == size
+    with pytest.raises(DiskError):
+        recorder.close()
+    with Record(path) as record:
+        assert_holds_frames(record, range(64))
+
+
+@pytest.mark.parametrize("system", ["without the call", "with a file system that refuses it"])
+def test_systems_that_can_not_allocate_write_zeros_instead(tmp_path, monkeypatch, system):
+    def refused(*_arguments):
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    if system == "without the call":
+        monkeypatch.delattr(os, "posix_fallocate", raising=False)
+    else:
+        monkeypatch.setattr(os, "posix_fallocate", refused, raising=False)
+    with Record(written(tmp_path / "run.h5", FRAMES)) as record:
+        assert_holds_frames(record, range(FRAMES))
+
+
+@pytest.mark.parametrize("ending", ["flush", "close"])
+def test_flushed_frames_are_on_the_disk_before_anything_later_is(tmp_path, monkeypatch, ending):
+    path, fsync, synced = tmp_path / "run.h5", os.fsync, []
+    recorder = started(path)
+    recorder.write(frame(0))
+
+    def watched(descriptor):
+        synced.append(os.fstat(descriptor).st_ino)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    recorder.write(frame(1))
+    assert synced == []
+    getattr(recorder, ending)()
+    assert synced == [path.stat().st_ino]
+    with Record(path) as record:
+        assert_holds_frames(record, range(2))
+    recorder.close()
+
+
+def test_a_device_that_can_not_store_frames_is_told(tmp_path, monkeypatch):
+    recorder = started(tmp_path / "run.h5")
+    recorder.write(frame(0))
+
+    def broken(_descriptor):
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as device, pytest.raises(DiskError, match=r"run\.h5: can't be written: Input/output"):
+        device.setattr(os, "fsync", broken)
+        recorder.flush()
+    recorder.close()
