@@ -10,28 +10,60 @@ if TYPE_CHECKING:
     from warpflag.record.recorder import Recorder
     from warpflag.run.simulation import NumericalError, Simulation
     from warpflag.scene import Scene, SceneError, load, with_values
+    from warpflag.scene.sections import (
+        Body,
+        External,
+        Flagella,
+        FlagellumOverride,
+        Fluid,
+        Hydrodynamics,
+        Motor,
+        Numerics,
+        Start,
+        Steric,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
+    "Body",
+    "External",
+    "Flagella",
+    "FlagellumOverride",
+    "Fluid",
+    "Hydrodynamics",
+    "Motor",
     "NumericalError",
+    "Numerics",
     "Record",
     "Recorder",
     "Scene",
     "SceneError",
     "Simulation",
+    "Start",
+    "Steric",
     "__version__",
     "load",
     "with_values",
 ]
 
-# Loaded on first use, so that `import warpflag` and the command line's --help stay quick.
+# Where each name lives; loaded on first use, so that `import warpflag` and the command line's --help stay quick.
 _HOMES = {
+    "Body": "scene.sections",
+    "External": "scene.sections",
+    "Flagella": "scene.sections",
+    "FlagellumOverride": "scene.sections",
+    "Fluid": "scene.sections",
+    "Hydrodynamics": "scene.sections",
+    "Motor": "scene.sections",
     "NumericalError": "run.simulation",
+    "Numerics": "scene.sections",
     "Record": "record",
     "Recorder": "record.recorder",
     "Scene": "scene",
     "SceneError": "scene",
     "Simulation": "run.simulation",
+    "Start": "scene.sections",
+    "Steric": "scene.sections",
     "load": "scene",
     "with_values": "scene",
 }
@@ -41,3 +73,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(importlib.import_module(f"warpflag.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'warpflag' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

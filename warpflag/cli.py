@@ -100,27 +100,30 @@ def _parser() -> argparse.ArgumentParser:
     plot = commands.add_parser(
         "plot",
         help="draw the curves of runs",
-        description="Draws bundle length, phase difference and contact force of runs over time; needs matplotlib, the "
-        "extra plot. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
+        description="Draws what was measured on a run over time, or compares several runs in phase difference, bundle "
+        "length and contact force; needs matplotlib, the extra plot. Runs are labelled by what differs between their "
+        "scenes. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
     )
     plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory")
     plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
     plot.add_argument(
         "--as",
         dest="kind",
-        choices=("series", "comparison"),
-        help="panels with contact forces, or one of all runs (default: series of one run, comparison of several)",
+        choices=("dashboard", "comparison"),
+        help="all curves of one run, or several runs in the same panels (default: by the number of DIR)",
     )
     plot.set_defaults(command=_plot)
 
     render = commands.add_parser(
         "render",
         help="draw a run as a picture or a film",
-        description="Draws a run or its movie. A .webp or .gif needs Pillow, an .mp4 ffmpeg (extra render). "
+        description="Draws a run or its movie. Letters, .jpg, .webp and .gif need Pillow, .mp4 ffmpeg (extra render). "
         "Flagella are drawn with a radius of 0.05 um; the picture says by how much that is too thick.",
     )
     render.add_argument("source", metavar="DIR", help="run directory, or a .usdc, .usda or .usdz file")
-    render.add_argument("-o", dest="output", metavar="FILE", required=True, help="ends in .png, .webp, .gif or .mp4")
+    render.add_argument(
+        "-o", dest="output", metavar="FILE", required=True, help="ends in .png, .jpg, .webp, .gif or .mp4"
+    )
     render.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="pixels (default: 1280x720)")
     render.add_argument(
         "--times", type=float, nargs="+", default=[], metavar="MS", help="of a picture [ms]; several make a sheet"
@@ -135,14 +138,15 @@ def _parser() -> argparse.ArgumentParser:
         "export", help="write a record in another format", description="Writes the record of a run in another format."
     )
     export.add_argument("directories", nargs="+", metavar="DIR", help="run directory; several make one USD movie")
-    export.add_argument("--to", choices=("usd", "vtkhdf", "csv"), required=True, help="format")
+    export.add_argument("--to", choices=("usd", "html", "vtkhdf", "xyz", "csv"), required=True, help="format")
     export.add_argument(
         "-o",
         dest="output",
         metavar="FILE",
-        help="default: movie.usdc, run.vtkhdf or run.csv in DIR; a movie may end in .usdc, .usda or .usdz",
+        help="default: movie.usdc, cell.html or run.FORMAT in DIR; a movie may end in .usdc, .usda or .usdz",
     )
     export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
+    export.add_argument("--mesh", action="store_true", help="a USD movie of meshes, for Blender")
     export.set_defaults(command=_export)
 
     for command in (render, export):
@@ -195,7 +199,7 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _check_movie(path: str) -> int:
-    from warpflag.view.usd_check import problems_of
+    from warpflag.view.usd.check import problems_of
 
     found = problems_of(path)
     print("\n".join(found) or f"{path}: plays")
@@ -210,20 +214,19 @@ def _scene(options: argparse.Namespace) -> Scene:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from pathlib import Path
-
     from warpflag.view import figures
 
-    names = [Path(directory).resolve().name for directory in options.directories]
-    labels = names if len(set(names)) == len(names) else options.directories
-    runs = [figures.read(directory, label) for directory, label in zip(options.directories, labels, strict=True)]
-    comparison = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
-    figures.save(figures.comparison(runs) if comparison else figures.time_series(runs), options.output)
+    runs = [figures.read(directory) for directory in options.directories]
+    compared = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
+    if len(runs) > 1 and not compared:
+        return _say("plot --as dashboard takes one DIR", BAD_INPUT)
+    figures.save(figures.comparison(runs) if compared else figures.dashboard(runs[0]), options.output)
     print(options.output)
     return DONE
 
 
 def _render(options: argparse.Namespace) -> int:
+    from warpflag.view.notes import can_write
     from warpflag.view.render import render
 
     filmed_anew = options.color or options.follow or options.slow_down
@@ -243,6 +246,8 @@ def _render(options: argparse.Namespace) -> int:
     )
     if not options.quiet:
         print(options.output)
+        if not can_write():
+            _say("drawn without time and scale bar: they need Pillow (pip install 'warpflag[render]')", DONE)
     return DONE
 
 
@@ -251,24 +256,30 @@ def _export(options: argparse.Namespace) -> int:
     from pathlib import Path
 
     from warpflag.record import Record
-    from warpflag.view import export, usd
+    from warpflag.view import export, page, usd
 
-    names = {"usd": "movie.usdc", "vtkhdf": "run.vtkhdf", "csv": "run.csv"}
-    path = Path(options.output or Path(options.directories[0]) / names[options.to])
+    name = {"usd": "movie.usdc", "html": "cell.html"}.get(options.to, f"run.{options.to}")
+    path = Path(options.output or Path(options.directories[0]) / name)
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
         return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
+    if options.mesh and options.to != "usd":
+        return _say("--mesh is for movies: --to usd", BAD_INPUT)
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":
-            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames)
+            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames, mesh=options.mesh)
             usd.write_movie(records, path, shot)
+        elif options.to == "html":
+            page.write_page(records[0], path, options.color or "flagellum")
         else:
-            {"vtkhdf": export.write_vtkhdf, "csv": export.write_csv}[options.to](records[0], path)
+            {"vtkhdf": export.write_vtkhdf, "xyz": export.write_xyz, "csv": export.write_csv}[options.to](
+                records[0], path
+            )
     print(path)
     return DONE
 
 
-def _shot(options: argparse.Namespace, **more: float | None) -> Shot:
+def _shot(options: argparse.Namespace, **more: float | bool | None) -> Shot:
     """How a movie is to be filmed, by what was said of it."""
     from warpflag.view.usd import Shot
 

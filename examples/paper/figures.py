@@ -12,9 +12,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import insets
 import mobility
 import numpy as np
 import scenes
+import snapshots
 import table
 from batch import run_missing
 
@@ -48,14 +50,14 @@ def figure_3(runs: Path, length: int) -> Figure:
             model = zipper.measured(record, times[0], times[-1])
         fitted = zipper.fit(model, times - times[0], lengths, "phase_velocity").zipper
         curve = 1e3 * times, zipper.bundle_length(fitted, times - times[0])
-        curves.append(figures.read(directory, f"Φ = {angle}°", curve))
-    return figures.time_series(curves, forces_of=[f"Φ = {angle}°" for angle in (44, 90)])
+        curves.append(insets.curves_of(directory, f"Φ = {angle}°", curve))
+    return insets.time_series(curves, forces_of=[f"Φ = {angle}°" for angle in (44, 90)])
 
 
 def figure_4(runs: Path, torque: str) -> Figure:
     """The ablations."""
-    curves = [figures.read(runs / f"T{torque}-{name}", label) for name, label in PAPER_NAMES.items()]
-    return figures.comparison(curves, dashed=[PAPER_NAMES["no-hi"], PAPER_NAMES["anchored"]])
+    curves = [insets.curves_of(runs / f"T{torque}-{name}", label) for name, label in PAPER_NAMES.items()]
+    return insets.comparison(curves, dashed=[PAPER_NAMES["no-hi"], PAPER_NAMES["anchored"]])
 
 
 def main() -> None:
@@ -78,7 +80,7 @@ def main() -> None:
     output = HERE / "figures"
     output.mkdir(exist_ok=True)
     drawn = {
-        "figure-2": figures.snapshots(runs / "L8-phi90", np.arange(0.0, 17.6, 2.5)),
+        "figure-2": snapshots.snapshots(runs / "L8-phi90", np.arange(0.0, 17.6, 2.5)),
         "figure-3": figure_3(runs, 8),
         "figure-3-short": figure_3(runs, 6),
         "figure-4": figure_4(runs, "3.4"),

@@ -11,7 +11,7 @@ from warpflag.observables import segment_tangents
 from warpflag.record import Record
 from warpflag.scene import loads
 from warpflag.scene.resistance import filament_mobility, pair_radius
-from warpflag.view.figures import COLORS, STYLE, TWO_COLUMNS
+from warpflag.view.figures import COLORS, TWO_COLUMNS, styled
 
 
 def mobility(positions: np.ndarray, first_node: np.ndarray, h: float, radius: float, drag: tuple) -> np.ndarray:
@@ -55,10 +55,9 @@ def smallest_eigenvalues(record: Record) -> np.ndarray:
 
 def figure(runs: dict[str, Path], start: float):
     """Smallest eigenvalue, nearest nodes and contact force of runs from `start` [s] on; by label."""
-    import matplotlib.pyplot as plt
-
-    with plt.rc_context(STYLE):
-        drawn, panels = plt.subplots(1, 3, figsize=(TWO_COLUMNS, 2.3), layout="constrained")
+    with styled() as figure_of:
+        drawn = figure_of(figsize=(TWO_COLUMNS, 2.3), layout="constrained")
+        panels = drawn.subplots(1, 3)
         for (label, directory), color in zip(runs.items(), COLORS, strict=False):
             with Record(directory) as record:
                 middle = int(record.first_node[1])

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 import pytest
 from warpflag_kernels.fluid import node_velocity
-from warpflag_kernels.implicit import first_velocity, linear_system, linearised, step_flow
+from warpflag_kernels.implicit import linear_system, linearised, step_flow
 from warpflag_kernels.rod import elastic
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
@@ -264,13 +264,11 @@ def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_s
     system = np.eye(6 + 4 * b.count) / step + gain * exact.mobility() @ exact.hessian()
     inverse, s = exact.local_inverse(), b.stepper
     s.law.gain.fill_(gain)
-    if mode != "none":
-        step_flow.build(b.model, b.state, s.flow)
 
     def applied(x: np.ndarray) -> np.ndarray:
         out = b.increment()
         given = b.increment(x[:6], x[6:].reshape(-1, 4))
-        linearised.apply(b.model, b.state, s.stiffness, band, s.flow, s.law.gain, given, out)
+        linearised.apply(b.model, b.state, s.stiffness, band, s.law.gain, given, out)
         return flat(out)
 
     x = random.uniform(-1, 1, 6 + 4 * b.count)
@@ -293,7 +291,7 @@ def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_s
 @pytest.mark.parametrize("mode", ["all", "within", "between"])
 def test_first_velocities_are_those_of_the_pair_sum_in_single_precision(mode, device, precision):
     b = bench({**UNEQUAL, "hydrodynamics.mode": mode}, precision, device)
-    if not first_velocity.serves(b.model):
+    if not step_flow.stores_pairs(b.model):
         pytest.skip("where a thread does not sum a whole cell, no coefficients are kept")
     step_flow.build(b.model, b.state, b.stepper.flow)
     b.data.force.assign(np.random.default_rng(8).uniform(-1, 1, (b.count, 3)))
@@ -301,6 +299,6 @@ def test_first_velocities_are_those_of_the_pair_sum_in_single_precision(mode, de
     free = np.setdiff1d(np.arange(b.count), b.first)
     exact = b.data.velocity.numpy()[free].copy()
     b.data.velocity.zero_()
-    first_velocity.node_velocities(b.model, b.state, b.stepper.flow)
+    step_flow.single_velocities(b.model, b.state, b.stepper.flow)
     found = b.data.velocity.numpy()[free]
     assert 0.0 < np.abs(found - exact).max() < 2e-6 * np.abs(exact).max()

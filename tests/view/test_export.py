@@ -15,7 +15,7 @@ from warpflag.record import Record, RecordError
 from warpflag.record.recorder import Recorder
 from warpflag.scene import dumps
 from warpflag.view.coloring import Coloring
-from warpflag.view.export import write_csv, write_vtkhdf
+from warpflag.view.export import write_csv, write_vtkhdf, write_xyz
 
 
 @pytest.fixture
@@ -153,6 +153,7 @@ def test_the_command_refuses_in_one_line(record, tmp_path, capsys, monkeypatch):
     for arguments, word in (
         (["run", "run", "--to", "csv", "-o", "two.csv"], "several DIR"),
         (["run", "run", "--to", "usd"], "-o"),
+        (["run", "--to", "csv", "--mesh"], "--to usd"),
         (["run", "--to", "usd", "--color", "mood"], "phase_difference"),
         (["run", "--to", "usd", "-o", "movie.avi"], ".usdz"),
     ):
@@ -170,3 +171,37 @@ def test_check_tells_what_is_wrong_with_a_movie(record, tmp_path, capsys, monkey
     Path("movie.usda").write_text(Path("movie.usda").read_text().replace("catmullRom", "catmulRom"))
     assert cli.main(["check", "movie.usda"]) == 2
     assert "catmulRom" in capsys.readouterr().out
+
+
+def test_xyz_read_by_the_rules_of_the_format(record, tmp_path):
+    """A count, a comment with the names and widths of the columns, then a line per particle."""
+    write_xyz(record, tmp_path / "run.xyz")
+    lines = (tmp_path / "run.xyz").read_text().splitlines()
+    assert len(lines) == 5 * (2 + 84)
+    for frame in range(5):
+        count, comment, *rows = lines[frame * 86 : (frame + 1) * 86]
+        assert int(count) == len(rows) == 84
+        facts = dict(word.split("=", 1) for word in comment.replace('"F F F"', "none").split())
+        assert float(facts["Time"]) == pytest.approx(record.times[frame])
+        assert float(facts["bundle_length"]) == pytest.approx(0.1 * frame)
+        described = facts["Properties"].split(":")
+        names, widths = described[::3], [int(width) for width in described[2::3]]
+        table = [row.split() for row in rows]
+        assert {len(row) for row in table} == {sum(widths)}
+        ends = np.cumsum(widths)
+        column = {
+            name: [row[end - width : end] for row in table]
+            for name, width, end in zip(names, widths, ends, strict=True)
+        }
+        assert [species for (species,) in column["species"]] == ["B", *"N" * 83]
+        positions = np.array(column["pos"], float)
+        np.testing.assert_allclose(positions[1:], record.positions[frame], rtol=1e-8, atol=1e-12)
+        np.testing.assert_allclose(positions[0], record.body_position[frame], rtol=1e-8, atol=1e-12)
+        np.testing.assert_allclose(np.array(column["orientation"][0], float), record.body_orientation[frame], atol=1e-8)
+        assert column["aspherical_shape"][0] == ["0.4", "0.4", "1.25"]
+        flagella = np.array(column["flagellum"], int).ravel()
+        np.testing.assert_array_equal(flagella, [-1, *np.repeat([0, 1, 2], np.diff(FIRST_NODE))])
+        expected = Coloring("curvature", record, THREE).values(
+            record.positions[frame : frame + 1], slice(frame, frame + 1)
+        )
+        np.testing.assert_allclose(np.array(column["curvature"], float).ravel()[1:], expected[0], rtol=1e-8)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
+from tests.films import made_record
+from tests.runs import executed, small
 from tests.shapes import Zipping
 from warpflag import cli
 from warpflag.base.output import OutputError
-from warpflag.record.recorder import Recorder
-from warpflag.run.simulation import Simulation
-from warpflag.scene import Flagella, Scene
+from warpflag.scene import Scene, with_values
+from warpflag.view.coloring import FLAGELLUM_COLORS, linear
+from warpflag.view.labels import labels_of
 
 matplotlib = pytest.importorskip("matplotlib")
 
@@ -22,73 +26,117 @@ def made(tmp_path_factory):
     return Zipping(tmp_path_factory.mktemp("zipping"))
 
 
-def curves_of(axes):
-    return {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+def panels_of(figure):
+    """Panels by their title."""
+    return {axes.get_title(loc="left"): axes for axes in figure.axes}
 
 
-def labels_of(figure):
-    axes = [*figure.axes, *(child for each in figure.axes for child in each.child_axes)]
-    return [(each.get_xlabel(), each.get_ylabel()) for each in axes]
+THETA, LENGTH, FORCE = r"phase difference $\langle\theta\rangle$", "bundle length $l_r$", "contact force $f_c$ (pN/µm)"
 
 
-def test_time_series_draws_theta_length_and_force(made, tmp_path):
-    model = np.array([1.0, 2.0]), np.array([0.4, 0.5])
-    runs = [figures.read(made.directory, "a", model), figures.read(made.directory, "b")]
-    figure = figures.time_series(runs, forces_of=["b"])
-    above, below = figure.axes
-    assert curves_of(below)["a"][:, 0] == pytest.approx(1e3 * made.times)
-    assert curves_of(below)["a"][:, 1] == pytest.approx(np.maximum(made.front(made.times), 0.0), abs=0.04)
-    assert curves_of(above)["b"][:, 1] == pytest.approx(runs[1].phase_difference)
-    assert any(np.array_equal(line.get_xydata(), np.stack(model, axis=1)) for line in below.get_lines())
-    for axes in (above, below):
-        (inset,) = axes.child_axes
-        (force,) = inset.get_lines()
-        assert force.get_ydata() == pytest.approx(1.0 + made.times)
-    times, force = "t (ms)", r"$f_c$ (pN/µm)"
-    assert labels_of(figure)[1:] == [(times, r"$l_r$"), (times, force), (times, force)]
-    figures.save(figure, tmp_path / "series.png")
-    assert (tmp_path / "series.png").stat().st_size > 10_000
+def test_a_comparison_draws_each_quantity_in_a_panel_of_its_own(made):
+    run = figures.read(made.directory)
+    panels = panels_of(figures.comparison([run, run, run]))
+    assert list(panels) == [THETA, LENGTH, FORCE]
+    for axes in panels.values():
+        assert len(axes.get_lines()) == 3
+        assert all(line.get_xdata() == pytest.approx(1e3 * made.times) for line in axes.get_lines())
+    assert panels[LENGTH].get_lines()[0].get_ydata() == pytest.approx(np.maximum(made.front(made.times), 0.0), abs=0.04)
+    assert panels[FORCE].get_lines()[0].get_ydata() == pytest.approx(1.0 + made.times)
+    assert panels[FORCE].get_xlabel() == "t (ms)"
 
 
-def test_comparison_draws_every_run_and_theta_inside(made):
-    runs = [figures.read(made.directory, label) for label in ("a", "b", "c")]
-    figure = figures.comparison(runs, dashed=["c"])
-    (axes,) = figure.axes
-    (inset,) = axes.child_axes
-    assert list(curves_of(axes)) == ["a", "b", "c"]
-    assert [line.get_linestyle() for line in inset.get_lines()] == ["-", "-", "--"]
-    assert labels_of(figure) == [("t (ms)", r"$l_r$"), ("t (ms)", r"$\langle\theta\rangle$")]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b", "c"]
+def boxes_of(figure):
+    """Where panels and legends are, in pixels."""
+    figure.draw_without_rendering()
+    return [axes.get_window_extent() for axes in figure.axes], [each.get_window_extent() for each in figure.legends]
 
 
-def test_a_run_is_called_after_its_directory(made):
-    assert figures.read(made.directory).label == made.directory.name
+def test_nothing_is_drawn_over_curves(made):
+    runs = [figures.read(made.directory, f"a rather long label of run {k}") for k in range(20)]
+    for figure in (figures.comparison(runs), figures.dashboard(made.directory)):
+        panels, legends = boxes_of(figure)
+        for a, b in itertools.combinations(panels + legends, 2):
+            assert not a.overlaps(b)
+        assert all(not axes.child_axes and not axes.texts and axes.get_legend() is None for axes in figure.axes)
+        for axes, box in zip(figure.axes, panels, strict=True):
+            assert box.width > 150 and box.height > 60, axes.get_title(loc="left")
 
 
-def test_snapshots_follow_the_body_and_show_what_is_in_front(made):
-    figure = figures.snapshots(made.directory, [0.0, 4.02, 8.0], columns=2)
-    panels = [axes for axes in figure.axes if axes.collections]
-    assert [axes.texts[0].get_text() for axes in panels] == ["0.0 ms", "4.0 ms", "8.0 ms"]
-    assert figure.axes[-1].texts[-1].get_text() == "1 µm"
-    for axes in panels:
-        strokes = axes.collections[0]
-        lines, widths = np.array(strokes.get_segments()), np.array(strokes.get_linewidths())
-        body = lines[widths.argmax()]
-        # Two times 30 segments with their rims, and the body, centred, 1.7 um between the centres of its caps.
-        assert len(lines) == 2 * 2 * 30 + 1
-        np.testing.assert_allclose(body, [[-0.85, 0.0], [0.85, 0.0]], atol=1e-9)
-        points_per_um = 72 * figure.get_figwidth() * axes.get_position().width / np.ptp(axes.get_xlim())
-        assert widths.max() == pytest.approx(0.8 * points_per_um)
-        assert axes.get_position().height * figure.get_figheight() * 72 == pytest.approx(
-            points_per_um * np.ptp(axes.get_ylim())
-        )
+def test_twenty_runs_look_different(made):
+    runs = [figures.read(made.directory, str(k)) for k in range(20)]
+    lines = figures.comparison(runs).axes[0].get_lines()
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 20
 
 
-def test_one_flagellum_has_no_bundle_to_plot(tmp_path):
-    scene = Scene(name="one", duration=2e-5, frames=2, flagella=Flagella(count=1, length=1.0))
-    Simulation(scene, device="cpu", reporters=[Recorder(tmp_path / "run.h5")]).run()
-    with pytest.raises(OutputError, match="one flagellum"):
-        figures.read(tmp_path)
+def test_twelve_colours_are_told_apart():
+    """By their distance in CIE L*a*b*, where 2 can just be seen."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+    def lab(color):
+        share = to_xyz @ linear(color) / np.array([0.9505, 1.0, 1.089])
+        x, y, z = np.where(share > 0.008856, np.cbrt(share), 7.787 * share + 16 / 116)
+        return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+    assert len(FLAGELLUM_COLORS) == 12
+    for a, b in itertools.combinations(FLAGELLUM_COLORS, 2):
+        assert np.linalg.norm(lab(a) - lab(b)) > 20, (a, b)
+
+
+def test_a_dashboard_draws_everything_known_of_a_run(tmp_path):
+    directory = executed(small({"flagella.count": 3, "flagella.length": 1.0}), tmp_path / "run")
+    figure = figures.dashboard(directory)
+    panels = panels_of(figure)
+    assert len(panels) == 7 and len(figure.axes) == 7
+    (motors,) = (axes for title, axes in panels.items() if title.startswith("motor rate (Hz)"))
+    assert len(motors.get_lines()) == 3
+    energy = figures.read(directory).curves["elastic_energy"].values[:, 0]
+    assert panels["elastic energy (pN µm)"].get_lines()[0].get_ydata() == pytest.approx(energy)
+    assert all(axes.get_ylim()[0] <= 0.0 for axes in panels.values())
+
+
+def test_one_flagellum_has_a_dashboard_without_a_bundle(tmp_path):
+    directory = executed(small({"flagella.count": 1}), tmp_path / "run")
+    panels = panels_of(figures.dashboard(directory))
+    assert "swimming speed $v$ (µm/s)" in panels and LENGTH not in panels
+    assert "swimming speed $v$ (µm/s)" in panels_of(figures.comparison([directory, directory]))
+
+
+def test_a_short_peak_does_not_flatten_the_rest_and_is_told(tmp_path):
+    with made_record(tmp_path, 400) as record:
+        assert record.observables["motor_rate"].shape == (400, 3)
+    run = figures.read(tmp_path)
+    run.curves["motor_rate"].values[:] = 10.0
+    run.curves["motor_rate"].values[1] = 5000.0
+    axes = next(axes for title, axes in panels_of(figures.dashboard(run)).items() if title.startswith("motor"))
+    assert 10.0 < axes.get_ylim()[1] < 20.0
+    assert axes.get_title(loc="right") == "up to 5000"
+
+
+@pytest.mark.parametrize(
+    "changes, expected",
+    [
+        ([{"motor.torque": 2.0}, {"motor.torque": 3.0}], ("motor.torque (pN µm)", ["2", "3"], [2.0, 3.0])),
+        ([{"steric.enabled": True}, {"steric.enabled": False}], ("steric.enabled", ["True", "False"], None)),
+        (
+            [{"motor.torque": 2.0, "duration": 0.1}, {"flagella.length": 8.0}],
+            ("", ["length 6, torque 2", "length 8, torque 3.4"], None),
+        ),
+        ([{"duration": 0.1}, {"duration": 0.2}], ("duration (s)", ["0.1", "0.2"], [0.1, 0.2])),
+        ([{"name": "a"}, {"name": "b"}], ("", ["a", "b"], None)),
+        ([{}, {"name": "b"}, {}], ("", ["s (1)", "b", "s (3)"], None)),
+        (
+            [{"flagella.count": 2, "flagellum.1.torque": 1.0}, {"flagella.count": 2, "flagellum.1.torque": 2.0}],
+            ("flagellum.1.torque (pN µm)", ["1", "2"], [1.0, 2.0]),
+        ),
+    ],
+)
+def test_runs_are_labelled_by_what_differs(changes, expected):
+    assert labels_of([with_values(Scene(name="s"), values) for values in changes]) == expected
+
+
+def test_a_figure_displays_itself_in_a_notebook(made):
+    assert figures.dashboard(made.directory)._repr_png_().startswith(b"\x89PNG")
 
 
 def drawn_by_the_command(monkeypatch, *arguments):
@@ -101,15 +149,11 @@ def drawn_by_the_command(monkeypatch, *arguments):
     return figure
 
 
-def test_command_draws_a_series_of_one_run_and_compares_several(made, tmp_path, monkeypatch):
-    monkeypatch.chdir(made.directory.parent)
-    name = made.directory.name
-    assert len(drawn_by_the_command(monkeypatch, name, "-o", "a.png").axes) == 2
-    compared = drawn_by_the_command(monkeypatch, name, f"{name}/../{name}", "-o", "a.png")
-    assert len(compared.axes) == 1
-    # Two directories of one name are told apart by their paths.
-    assert list(curves_of(compared.axes[0])) == [name, f"{name}/../{name}"]
-    assert len(drawn_by_the_command(monkeypatch, name, name, "--as", "series", "-o", "a.png").axes) == 2
+def test_command_draws_a_dashboard_of_one_run_and_compares_several(made, monkeypatch):
+    run = str(made.directory)
+    assert len(panels_of(drawn_by_the_command(monkeypatch, run, "-o", "a.png"))) == 4
+    assert list(panels_of(drawn_by_the_command(monkeypatch, run, run, "-o", "a.png"))) == [THETA, LENGTH, FORCE]
+    assert len(panels_of(drawn_by_the_command(monkeypatch, run, "--as", "comparison", "-o", "a.png"))) == 3
 
 
 def test_command_writes_the_format_of_the_ending_and_refuses_others(made, tmp_path, capsys):
@@ -122,3 +166,6 @@ def test_command_writes_the_format_of_the_ending_and_refuses_others(made, tmp_pa
     assert "a.docx" in said and ".png" in said and said.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.svg"]
     assert cli.main(["plot", str(tmp_path / "absent"), "-o", good]) == 2
+    assert cli.main(["plot", str(made.directory), str(made.directory), "--as", "dashboard", "-o", good]) == 2
+    with pytest.raises(OutputError, match=r"\.docx"):
+        figures.save(figures.dashboard(made.directory), bad)

@@ -40,6 +40,11 @@ class CellState:
     elastic_energy: np.ndarray
     steric_force: float
 
+    def __repr__(self) -> str:
+        count = len(self.motor_angle)
+        cell = f"{count} flagell{'a' if count > 1 else 'um'}, {len(self.positions)} nodes"
+        return f"<CellState at {1e3 * self.time:g} ms, step {self.step}: {cell}>"
+
 
 @dataclass(frozen=True)
 class Evaluation:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpflag.base.above import method_from
 from warpflag.record.frame_array import FrameArray, reading
 from warpflag.record.layout import (
     BODY_ORIENTATION,
@@ -51,6 +52,19 @@ class Record:
         self._arrays: dict[str, FrameArray] = {}
         if not self.path.is_file():
             raise RecordError(f"{self.path}: no such record")
+
+    def __repr__(self) -> str:
+        try:
+            times, count = self.times, len(self.first_node) - 1
+        except RecordError:
+            return f"<Record {self.path}: not readable>"
+        until = f" to {1e3 * times[-1]:g} ms" if len(times) else ""
+        return f"<Record {self.path}: {count} flagell{'a' if count > 1 else 'um'}, {self.frame_count} frames{until}>"
+
+    to_xarray = method_from(
+        "warpflag.view.tables", "dataset", "The record as an xarray.Dataset in memory; needs the extra `notebook`."
+    )
+    _repr_html_ = method_from("warpflag.view.page", "notebook_frame", "The page of the record, as a notebook shows it.")
 
     def __enter__(self) -> Record:
         return self

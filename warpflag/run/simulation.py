@@ -89,6 +89,12 @@ class Simulation:
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
         self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
 
+    def __repr__(self) -> str:
+        scene, count = self.scenes[0], len(self.scenes)
+        cells = scene.name if count == 1 else f"{count} cells"
+        time = f"{1e3 * float(self.times.min()):g} of {1e3 * scene.duration:g} ms"
+        return f"<Simulation of {cells} on {self.device}: {time}, stepper {scene.numerics.stepper}>"
+
     @property
     def times(self) -> np.ndarray:
         """Simulated time of every cell [s], shape [cell_count]."""

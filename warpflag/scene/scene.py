@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from warpflag.base.above import method_from
 from warpflag.scene.errors import Problems, SceneError
 from warpflag.scene.sections import (
     Body,
@@ -99,6 +100,8 @@ class Scene(Section, key=""):
         with problems.gathered():
             self._check_phases()
         problems.raise_any()
+
+    _repr_html_ = method_from("warpflag.view.scene_table", "scene_table", "Tables of the settings, for notebooks.")
 
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""

@@ -17,7 +17,7 @@ from warpflag_kernels.implicit import (
     collocation,
     contact_solve,
     delassus,
-    first_velocity,
+    krylov,
     linear_system,
     linearised,
     quasi_newton,
@@ -36,6 +36,7 @@ LONGEST_STEP = 3.0e-5
 """Longest step that the accuracy control takes [s]."""
 FIRST_TOLERANCE = 2.0
 """Tolerance of the gaps in the first iteration over that in the second."""
+_STABILITY_MEMORY = ("kappa", "strong")
 OVER_IMPLICIT_CROWD = 3.0
 """Over-implicitness with which three flagella or more begin, until it has been measured."""
 
@@ -96,7 +97,7 @@ class ImplicitStepper:
     Attributes:
         data: the struct `Implicit`.
         steps: the struct `StepControl`.
-        stability: the struct `Stability`; None where over-implicitness is not measured.
+        stability: the struct `Stability`; None where nodes cause no flows.
         history: increments of the last two steps.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the pose that was linearised last.
         contacts, law: structs `Contacts` and `ContactLaw`.
@@ -118,11 +119,12 @@ class ImplicitStepper:
         fixed = [scene.numerics.time_step for scene in scenes]
         accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
         self.steps = step_control.allocate(accuracies, model.device)
-        # Three flagella or more need their over-implicitness measured.
+        # Without flows between nodes the matrix is the whole of the linearised equations.
         self.stability: Any = None
-        if model.switches.pairs != "none" and max(len(s.resolved_flagella()) for s in scenes) > 2:
+        if model.switches.pairs != "none":
             self.stability = stability.allocate(model)
             linearised.allocate(model, system.state)
+            self._krylov = krylov.allocate(model)
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.restart()
@@ -144,7 +146,7 @@ class ImplicitStepper:
             contact_solve.warm_start(model, state, i.trust, x.expected, self.contacts, self.law)
         if model.switches.pairs != "none":
             step_flow.build(model, state, self.flow, self.contacts if self._touching else None)
-        self._evaluate(in_single=first_velocity.serves(model))
+        self._evaluate(in_single=step_flow.stores_pairs(model))
         hessian.joint_stiffness(model, state, self.stiffness)
         linear_system.factorise(model, state, self.stiffness, band)
         solution = self._solve(x.last_at_first, x.zero, first=True)
@@ -187,7 +189,7 @@ class ImplicitStepper:
             contact_list.act(model, state, self.contacts, self.law.force)
         body.body_motion(model, state)
         if in_single:
-            first_velocity.node_velocities(model, state, self.flow)
+            step_flow.single_velocities(model, state, self.flow)
         else:
             node_velocity.node_velocities(model, state)
 
@@ -203,18 +205,32 @@ class ImplicitStepper:
         kernel = collocation.kernels(model.precision).right_hand_side
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
         linear_system.solve(model, state, self.band, x.free)
-        if not self._touching:
-            return x.free
-        contact_solve.solve(
-            model, state, self.contacts, self.band, self.flow, x.free, self.law, x.solved,
-            coarse=FIRST_TOLERANCE if first else 1.0, anew=first,
+        if self._touching:
+            contact_solve.solve(
+                model, state, self.contacts, self.band, self.flow, x.free, self.law, x.solved,
+                coarse=FIRST_TOLERANCE if first else 1.0, anew=first,
+            )  # fmt: skip
+        if self.stability is not None:
+            wp.capture_if(self.stability.any_strong, self._solve_in_full)
+        return self._solution
+
+    @property
+    def _solution(self) -> Any:
+        """Where an iteration leaves its increment."""
+        return self._scratch.solved if self._touching else self._scratch.free
+
+    def _solve_in_full(self) -> None:
+        """With the full mobility, and the contact forces found, in cells that are strongly coupled."""
+        model, state = self._system.model, self._system.state
+        krylov.solve(
+            model, state, self.stiffness, self.band, self.law.gain, self.stability, self._krylov,
+            self._scratch.remaining, self._solution,
         )  # fmt: skip
-        return x.solved
 
     def _measure_stability(self) -> None:
         model, state = self._system.model, self._system.state
         stability.measure(
-            model, state, self.stiffness, self.band, self.flow, self.law.gain, self._scratch.remaining,
+            model, state, self.stiffness, self.band, self.law.gain, self._scratch.remaining,
             self.stability, self.data.over_implicit,
         )  # fmt: skip
 
@@ -223,12 +239,17 @@ class ImplicitStepper:
         self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
         self.data.history.zero_()
         self.data.trust.zero_()
+        if self.stability is not None:
+            self.stability.kappa.zero_()
+            self.stability.strong.zero_()
         restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
     def memory(self) -> dict[str, np.ndarray]:
         names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "trust")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
+        if self.stability is not None:
+            kept |= {name: getattr(self.stability, name).numpy().copy() for name in _STABILITY_MEMORY}
         for name, x in self._increments_kept().items():
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
@@ -239,6 +260,9 @@ class ImplicitStepper:
             whose, _, part = name.partition("_")
             if part in ("node", "body"):
                 getattr(kept[whose], part).assign(values)
+            elif name in _STABILITY_MEMORY:
+                getattr(self.stability, name).assign(values)
+                self.stability.any_strong.fill_(1)  # found anew in the first pass
             else:
                 getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
 

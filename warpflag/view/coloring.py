@@ -15,7 +15,16 @@ from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
 
-__all__ = ["BODY_COLOR", "QUANTITIES", "Coloring", "linear", "map_color"]
+__all__ = [
+    "BODY_COLOR",
+    "DISPLAY_RADIUS",
+    "FLAGELLUM_COLORS",
+    "QUANTITIES",
+    "UNDEFINED_COLOR",
+    "Coloring",
+    "linear",
+    "map_color",
+]
 
 QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force")
 
@@ -27,16 +36,22 @@ _PRIMVARS = {
 }
 _LABELS = {"phase_difference": "phase difference", "curvature": "curvature 1/µm", "steric_force": "steric force pN"}
 
-# Okabe & Ito's colours, told apart by colour-blind eyes too, darkest first; repeated beyond seven flagella.
-_FLAGELLUM_COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6fc4")
+# The first seven are Okabe & Ito's, told apart by colour-blind eyes too; the rest are far from them and each other.
+FLAGELLUM_COLORS = (
+    *("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#5b2a86", "#8a1538", "#7d4b1c", "#7fb800", "#00504f", "#4a4a4a"),
+)
+"""Of flagella and runs, sRGB; repeated beyond twelve."""
 # Samples of a map that grows evenly in lightness: dark violet, red, orange, pale yellow.
 _MAP = ("#2b1055", "#5c126e", "#8f2469", "#bf3952", "#e35933", "#f98c0a", "#f9c932", "#fcf4a3")
-_UNDEFINED_COLOR = "#9a9a9a"
+UNDEFINED_COLOR = "#9a9a9a"
 BODY_COLOR = "#dfcfae"
+DISPLAY_RADIUS = 0.05
+"""Of the flagella in pictures, pages and meshes, where they are thinner [um]: true to scale they would vanish."""
 
 
 def linear(color: str) -> NDArray[np.float32]:
-    """Linear RGB of a colour "#rrggbb" in sRGB."""
+    """Linear RGB of a colour "#rrggbb" in sRGB, shape [3]."""
     return _decoded(_srgb(color))
 
 
@@ -58,10 +73,14 @@ def _decoded(srgb: NDArray[np.floating]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Coloring:
-    """How a record's nodes are coloured by one of `QUANTITIES`.
+    """How a record's nodes are coloured by a quantity.
 
-    flagellum: a colour each. phase_difference: `nearest_phase_difference`, 0 to 1. curvature: `curvature`, 0 to
-    twice the intrinsic one. steric_force: `contact_load`, 0 to 8 F_0, a firm contact of two bundled flagella.
+    Attributes:
+        quantity: one of `QUANTITIES`: flagellum, a colour each; phase_difference, `nearest_phase_difference` from 0 to
+            1; curvature, `curvature` from 0 to twice the intrinsic one; steric_force, `contact_load` from 0 to 8 F_0,
+            a firm contact of two bundled flagella.
+        record: the run.
+        scene: of the record.
     """
 
     quantity: str
@@ -70,7 +89,7 @@ class Coloring:
 
     @property
     def primvar(self) -> str:
-        """Name of the primvar with the raw values."""
+        """Name of the USD primvar with the raw values."""
         return _PRIMVARS[self.quantity]
 
     @property
@@ -97,9 +116,11 @@ class Coloring:
         )
 
     def values(self, positions: NDArray[np.floating], frames: slice) -> NDArray[np.floating]:
-        """The quantity at the nodes of a block of frames, shape [frame, node]; of a single row where it never changes.
+        """The quantity at the nodes of a block of frames, shape [frame, node]; a single row where it never changes.
 
-        positions: of these frames [um], shape [frame, node, 3].
+        Args:
+            positions: of these frames [um], shape [frame, node, 3].
+            frames: which they are.
         """
         first_node = self.record.first_node
         if self.quantity == "flagellum":
@@ -116,9 +137,9 @@ class Coloring:
         """Linear RGB of values, shape [..., 3]; grey where they are undefined."""
         values = np.asarray(values, float)
         if self.quantity == "flagellum":
-            table = np.stack([linear(color) for color in _FLAGELLUM_COLORS])
+            table = np.stack([linear(color) for color in FLAGELLUM_COLORS])
             return table[values.astype(int) % len(table)]
         # By a table of 256: decoding each of millions of values would take longer than all the rest.
-        table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(_UNDEFINED_COLOR)])
+        table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(UNDEFINED_COLOR)])
         index = np.where(np.isnan(values), 256, np.clip(255.0 * values / self.highest + 0.5, 0.0, 255.0))
         return table[index.astype(int)]

@@ -1,4 +1,4 @@
-"""A record for other programs: VTKHDF for ParaView and VTK, CSV for tables. Units as in the record: um, pN, s, rad."""
+"""A record for other programs: VTKHDF for ParaView, extended XYZ for OVITO, CSV for tables. Units um, pN, s, rad."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from warpflag.record import Record, RecordError
 from warpflag.scene import loads
 from warpflag.view.coloring import Coloring
 
-__all__ = ["write_csv", "write_vtkhdf"]
+__all__ = ["write_csv", "write_vtkhdf", "write_xyz"]
 
 _BLOCK_POINTS = 1 << 16
 _KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 def write_vtkhdf(record: Record, path: str | Path) -> None:
-    """Writes the flagella as lines over time: a temporal PolyData that ParaView opens without a plugin.
+    """Writes the flagella as lines over time; ParaView opens the file without a plugin.
 
+    The file holds a PolyData with time steps.
     Points have the order of the record's nodes and its precision. Each carries its flagellum, curvature [1/um],
-    phase_difference with the nearest other flagellum and steric_force [pN] (see `warpflag.coloring`); each time step
+    phase_difference with the nearest other flagellum and steric_force [pN] (see `Coloring`); each time step
     body_position [um], body_orientation (x, y, z, w), motor_angle [rad] and the observables as field data.
 
-    Raises RecordError for a record without frames.
+    Raises:
+        RecordError: a record without frames.
+        OSError: the file can't be written.
     """
     import h5py
 
@@ -91,13 +94,56 @@ def _write_fields(root: Any, record: Record) -> None:
         sizes[name] = np.tile([values[0].size, 1], (frames, 1))  # components and tuples
 
 
+def write_xyz(record: Record, path: str | Path) -> None:
+    """Writes an extended XYZ file, which OVITO and ASE read: the nodes as particles N, the body as a particle B.
+
+    Each node has its radius [um], flagellum, curvature [1/um], steric_force [pN] and, of two flagella or more,
+    phase_difference, -1 where it is not defined. The body is an ellipsoid with half axes in aspherical_shape [um] and
+    its orientation (x, y, z, w); its flagellum is -1. The comment of each frame has the time [s] and the observables.
+
+    Raises:
+        RecordError: a record without frames.
+        OSError: the file can't be written.
+    """
+    _check_frames(record)
+    scene, first_node = loads(record.scene_text), record.first_node
+    quantities = ["curvature", "steric_force"] + ["phase_difference"] * (len(first_node) > 2)
+    flagellum = np.repeat(np.arange(len(first_node) - 1), np.diff(first_node))
+    columns = ["species:S:1", "pos:R:3", "radius:R:1", "aspherical_shape:R:3", "orientation:R:4", "flagellum:I:1"]
+    properties = ":".join([*columns, *(f"{name}:R:1" for name in quantities)])
+    half_axes = 0.5 * np.array([record.body_width, record.body_width, record.body_length])
+    body = " ".join(f"{value:.6g}" for value in half_axes)
+    thin = f"{record.filament_radius:.6g} 0 0 0 0 0 0 1"
+    single = {name: values for name, values in record.observables.items() if values.ndim == 1}
+    with whole(Path(path)) as temporary, temporary.open("w") as file:
+        for frame, time in enumerate(record.times.tolist()):
+            block = slice(frame, frame + 1)
+            positions = record.positions[block]
+            found = [Coloring(name, record, scene).values(positions, block)[0] for name in quantities]
+            values = np.nan_to_num(np.stack(found, axis=1), nan=-1.0)
+            known = [f"{name}={each[frame]:.9g}" for name, each in single.items() if np.isfinite(each[frame])]
+            file.write(f"{len(flagellum) + 1}\n")
+            file.write(f'Properties={properties} pbc="F F F" Time={time:.9g} {" ".join(known)}\n')
+            place, turn = record.body_position[frame], record.body_orientation[frame]
+            row = [*_texts(place), f"{half_axes.max():.6g}", body, *_texts(turn), "-1", *["0"] * len(quantities)]
+            file.write(f"B {' '.join(row)}\n")
+            for node, own, k in zip(positions[0], values, flagellum.tolist(), strict=True):
+                file.write(f"N {' '.join(_texts(node))} {thin} {k} {' '.join(_texts(own))}\n")
+
+
+def _texts(values: np.ndarray) -> list[str]:
+    return [f"{value:.9g}" for value in values.tolist()]
+
+
 def write_csv(record: Record, path: str | Path) -> None:
     """Writes two tables: `path` with a row per frame, and NAME_nodes.csv beside it with a row per node and frame.
 
     The first has time, step, body_position_x ..., body_orientation_x ... _w, motor_angle_0 ... and the observables;
     what a frame does not have (a rate in the first) is empty. The second has time, flagellum, node, x, y, z.
 
-    Raises RecordError for a record without frames.
+    Raises:
+        RecordError: a record without frames.
+        OSError: a file can't be written.
     """
     _check_frames(record)
     path = Path(path)
@@ -123,7 +169,7 @@ def write_csv(record: Record, path: str | Path) -> None:
 
 
 def _by_frame(record: Record) -> dict[str, np.ndarray]:
-    """What a frame has one of, by name."""
+    """What is recorded once per frame, not per node, by name; shape [frame] or [frame, ...]."""
     return {
         "body_position": record.body_position,
         "body_orientation": record.body_orientation,

@@ -1,33 +1,42 @@
-"""Figures of runs, made from their records: time series, comparisons, snapshots. Needs matplotlib (extra `plot`).
+"""Figures of runs from their records: a dashboard of one, a comparison of several. Needs matplotlib (extra `plot`).
 
-In print the figures are one column (86 mm) or two wide, with 8 point type.
+In print the figures are one column (86 mm) or two wide, with 8 point type. Nothing is drawn over curves: each quantity
+has a panel of its own, and legends stand outside. A figure displays itself where a notebook's cell ends with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warpflag.base.output import OutputError, whole
-from warpflag.observables import STRAY
-from warpflag.observables.arrays import Array, flagella, unit
-from warpflag.observables.recorded import bundle_lengths
-from warpflag.record import Record
+from warpflag.observables.arrays import Array
+from warpflag.record import Record, RecordError
+from warpflag.scene import Scene, loads
+from warpflag.view.coloring import FLAGELLUM_COLORS, map_color
+from warpflag.view.curves import Curve, curves
+from warpflag.view.labels import labels_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Curves", "comparison", "read", "save", "snapshots", "time_series"]
+__all__ = ["COLORS", "COLUMN", "STYLE", "TWO_COLUMNS", "Run", "comparison", "dashboard", "read", "save", "styled"]
 
-COLUMN, TWO_COLUMNS = 3.39, 7.0  # inches
-STYLE = {
+COLUMN, TWO_COLUMNS = 3.39, 7.0
+"""Widths of a figure of one and of two columns [inch]."""
+STYLE: Any = {
     "font.size": 8,
     "axes.labelsize": 8,
+    "axes.titlesize": 8,
     "legend.fontsize": 7,
+    "legend.title_fontsize": 7,
     "legend.frameon": False,
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
@@ -36,211 +45,215 @@ STYLE = {
     "axes.linewidth": 0.6,
     "lines.linewidth": 1.1,
 }
-# Okabe & Ito's colours, told apart by colour-blind readers.
-COLORS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#000000"]
+"""Settings of matplotlib for all figures."""
+COLORS = [FLAGELLUM_COLORS[k] for k in (1, 0, *range(2, len(FLAGELLUM_COLORS)))]
+"""Colours of runs in their order; beyond twelve runs lines are dashed, then dotted."""
+
+_LINE_STYLES = ("-", "--", ":", "-.")
+_BUNDLING = ("phase_difference", "bundle_length", "steric_force_density")
+_SWIMMING = ("body_speed", "body_rate", "elastic_energy")
+_SHARE_IN_VIEW = 0.99  # of the values of a panel, at least
+_PEAK = 1.6  # a panel shows all values when they reach no further than this times what that share needs
 
 
 @dataclass(frozen=True)
-class Curves:
+class Run:
     """What is drawn of a run.
 
     Attributes:
-        label: for the legend.
-        times: [ms], shape [frame_count].
-        phase_difference: <theta>, same shape.
-        bundle_length: l_r, same shape; it passes over gaps of `observables.STRAY`.
-        steric_force_density: f_c [pN/um], same shape.
-        model: times [ms] and l_r of a model, drawn dashed, or None.
+        label: its name in a legend; empty: the legend says what differs between the scenes.
+        scene: the scene of the record.
+        times: of the frames [ms], shape [frame_count].
+        curves: the observables by name.
     """
 
     label: str
+    scene: Scene
     times: Array
-    phase_difference: Array
-    bundle_length: Array
-    steric_force_density: Array
-    model: tuple[Array, Array] | None = None
+    curves: dict[str, Curve]
 
 
-def read(directory: str | Path, label: str | None = None, model: tuple[Array, Array] | None = None) -> Curves:
-    """The curves of a run; its label is the directory's name unless given.
+def read(directory: str | Path, label: str = "") -> Run:
+    """The curves of a run.
 
-    Raises RecordError where there is no record, and OutputError for a cell with one flagellum, which has no bundle.
+    Args:
+        directory: run directory or run.h5.
+        label: name in a legend; by default it says in what its scene differs from the others'.
+
+    Raises:
+        RecordError: no record, or one without frames.
     """
     with Record(directory) as record:
-        measured = record.observables
-        if "phase_difference" not in measured:
-            raise OutputError(f"{record.path}: has one flagellum; it takes two to be in phase and form a bundle")
-        return Curves(
-            label=label or Path(directory).resolve().name,
-            times=1e3 * record.times,
-            phase_difference=measured["phase_difference"],
-            bundle_length=bundle_lengths(record, gap=STRAY),
-            steric_force_density=measured["steric_force_density"],
-            model=model,
-        )
+        if record.frame_count == 0:
+            raise RecordError(f"{record.path}: holds no frames to draw")
+        found = {curve.name: curve for curve in curves(record)}
+        return Run(label, loads(record.scene_text), 1e3 * record.times, found)
 
 
-def time_series(runs: Sequence[Curves], forces_of: Sequence[str] | None = None) -> Figure:
-    """Phase difference and bundle length over time, f_c in an inset of each: the paper's Fig. 3(a) and (b).
+def dashboard(run: Run | str | Path) -> Figure:
+    """All curves of one run, a panel each.
 
-    forces_of: labels of the runs whose f_c is shown; default: all.
+    Args:
+        run: what `read` gave, or a run directory.
+
+    Raises:
+        RecordError: no record, or one without frames.
     """
-    plt = _pyplot()
-    with plt.rc_context(STYLE):
-        figure, (above, below) = plt.subplots(2, figsize=(COLUMN, 4.7), sharex=True, layout="constrained")
-        shown = [k for k, run in enumerate(runs) if forces_of is None or run.label in forces_of]
-        panels = (
-            (above, "phase_difference", r"$\langle\theta\rangle$", (0.52, 0.52, 0.46, 0.45)),
-            (below, "bundle_length", r"$l_r$", (0.60, 0.14, 0.38, 0.35)),
-        )
-        for axes, name, symbol, place in panels:
-            _draw(axes, runs, name)
-            axes.set(ylabel=symbol, xlim=(0.0, max(run.times[-1] for run in runs)))
-            inset = _inset(axes, place, r"$f_c$ (pN/µm)")
-            for k in shown:
-                inset.plot(runs[k].times, runs[k].steric_force_density, color=COLORS[k % len(COLORS)], linewidth=0.8)
-            inset.set_ylim(0.0, None)
-        for k, run in enumerate(runs):
-            if run.model is not None:
-                below.plot(*run.model, "--", color=COLORS[k % len(COLORS)], linewidth=0.9)
-        below.set_xlabel("t (ms)")
-        _legend(figure, above)
-        for axes, letter in ((above, "(a)"), (below, "(b)")):
-            axes.text(-0.14, 1.0, letter, transform=axes.transAxes, va="top", ha="right")
+    run = run if isinstance(run, Run) else read(run)
+    rows = -(-len(run.curves) // 2)
+    with styled() as figure_of:
+        figure = figure_of(figsize=(TWO_COLUMNS, 0.5 + 1.25 * rows), layout="constrained")
+        panels = [*figure.subplots(rows, 2, sharex=True, squeeze=False).T.ravel()]
+        if len(run.curves) < len(panels):
+            panels.pop(rows).remove()  # the upper right corner stays free, so that both columns end below
+        for axes, curve in zip(panels, run.curves.values(), strict=True):
+            many = curve.values.shape[1] > 1
+            for k, line in enumerate(curve.values.T):
+                color = FLAGELLUM_COLORS[k % len(FLAGELLUM_COLORS)] if many else COLORS[0]
+                axes.plot(run.times, line, color=color, linewidth=0.8 if many else None)
+            _set_range(axes, [curve])
+            axes.set_title(_title(curve) + (", a line per flagellum" if many else ""), loc="left")
+        _set_times(panels, [run], (panels[rows - 1], panels[-1]))
+        count = len(run.scene.resolved_flagella())
+        figure.suptitle(f"{run.label or run.scene.name}: {count} {'flagella' if count > 1 else 'flagellum'}")
     return figure
 
 
-def comparison(runs: Sequence[Curves], dashed: Sequence[str] = ()) -> Figure:
-    """Bundle length of several runs over time, their phase differences in the inset: the paper's Fig. 4.
+def comparison(runs: Sequence[Run | str | Path]) -> Figure:
+    """Phase difference, bundle length and contact force of several runs over time, a panel each.
 
-    dashed: labels of the runs that are drawn dashed.
+    Cells with one flagellum have none of them: where one is among the runs, speed, body rate and energy are drawn.
+
+    Args:
+        runs: what `read` gave, or run directories. Runs without a label are labelled by what differs between their
+            scenes; where that is one number, they are coloured by it.
+
+    Raises:
+        RecordError: no record, or one without frames.
     """
-    plt = _pyplot()
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(TWO_COLUMNS * 0.75, 3.1), layout="constrained")
-        _draw(axes, runs, "bundle_length", dashed)
-        axes.set(xlabel="t (ms)", ylabel=r"$l_r$", xlim=(0.0, max(run.times[-1] for run in runs)))
-        _legend(figure, axes)
-        inset = _inset(axes, (0.62, 0.15, 0.36, 0.40), r"$\langle\theta\rangle$")
-        _draw(inset, runs, "phase_difference", dashed)
-    return figure
-
-
-def snapshots(directory: str | Path, times: Sequence[float], columns: int = 4) -> Figure:
-    """The cell at several times [ms], body to the left, seen across its first axis: the paper's Fig. 2.
-
-    Every panel follows the body's centre and keeps the directions of time 0; the nearer of two flagella is drawn above.
-    """
-    plt = _pyplot()
-    with Record(directory) as record:
-        frames = [int(np.abs(1e3 * record.times - time).argmin()) for time in times]
-        panels = [_strokes(record, frame) for frame in frames]
-        labels = [f"{1e3 * record.times[frame]:.1f} ms" for frame in frames]
-    ends = np.concatenate([panel[0].reshape(-1, 2) for panel in panels])
-    low, high = ends.min(axis=0) - 0.5, ends.max(axis=0) + 0.5
-    rows = -(-len(panels) // columns)
-    points_per_um = 72 * TWO_COLUMNS / columns / (high - low)[0]
-    height = rows * (high - low)[1] * points_per_um / 72
-    with plt.rc_context(STYLE):
-        from matplotlib.collections import LineCollection
-
-        figure = plt.figure(figsize=(TWO_COLUMNS, height))
-        for k, ((lines, widths, colors), label) in enumerate(zip(panels, labels, strict=True)):
-            row, column = divmod(k, columns)
-            axes = figure.add_axes((column / columns, 1 - (row + 1) / rows, 1 / columns, 1 / rows))
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-            axes.axis("off")
-            strokes = LineCollection(
-                list(lines), linewidths=widths * points_per_um, colors=colors, capstyle="round", clip_on=False
-            )
-            axes.add_collection(strokes)
-            axes.text(0.02, 0.04, label, transform=axes.transAxes)
-        bar = high[0] - 0.4 - np.array([1.0, 0.0])
-        axes = figure.axes[-1]
-        axes.plot(bar, [low[1] + 0.5] * 2, color="black", linewidth=1.5)
-        axes.text(bar.mean(), low[1] + 0.6, "1 µm", ha="center", va="bottom")
+    read_runs = [run if isinstance(run, Run) else read(run) for run in runs]
+    title, labels, values = labels_of([run.scene for run in read_runs])
+    labels = [run.label or label for run, label in zip(read_runs, labels, strict=True)]
+    if any(run.label for run in read_runs):
+        title, values = "", None
+    names = [name for name in _BUNDLING if all(name in run.curves for run in read_runs)]
+    names = names or [name for name in _SWIMMING if all(name in run.curves for run in read_runs)]
+    if not names:
+        raise OutputError("these runs have no observable in common that could be compared")
+    with styled() as figure_of:
+        figure = figure_of(figsize=(TWO_COLUMNS * 0.75, 0.6 + 1.5 * len(names)), layout="constrained")
+        panels = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
+        for axes, name in zip(panels, names, strict=True):
+            for run, style in zip(read_runs, _styles(len(read_runs), values), strict=True):
+                axes.plot(run.times, run.curves[name].values[:, 0], **style)
+            found = [run.curves[name] for run in read_runs]
+            _set_range(axes, found)
+            axes.set_title(_title(found[0]), loc="left")
+        _set_times(panels, read_runs, panels[-1:])
+        if len(read_runs) > 1:
+            columns = -(-len(read_runs) // 24)
+            figure.legend(panels[0].get_lines(), labels, loc="outside right upper", title=title or None, ncols=columns)
     return figure
 
 
 def save(figure: Figure, path: str | Path, dpi: float = 300) -> None:
-    """Writes a figure, the ending of the path says the format (png, pdf, svg, ...), and lets go of it.
+    """Writes a figure; the file is whole or absent.
 
-    dpi: dots per inch of a format that has them.
+    Args:
+        figure: what this module returned, or any figure of matplotlib.
+        path: its ending says the format: png, jpg, pdf, svg, ...
+        dpi: dots per inch of a format that has them.
 
-    Raises OutputError for an unknown format.
+    Raises:
+        OutputError: an unknown format.
     """
-    path, plt = Path(path), _pyplot()
+    path = Path(path)
     formats = figure.canvas.get_supported_filetypes()
     if path.suffix.lstrip(".") not in formats:
         raise OutputError(f"{path}: must end in one of .{', .'.join(sorted(formats))}")
-    with plt.rc_context(STYLE), whole(path) as temporary:
+    with styled(), whole(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
-    plt.close(figure)
 
 
-def _pyplot() -> Any:
+@contextlib.contextmanager
+def styled() -> Iterator[Any]:
+    """Within the block matplotlib has `STYLE`; gives the class of figures that display themselves in a notebook.
+
+    Figures are made without pyplot, so that they neither open a window nor change what a notebook draws with.
+
+    Raises:
+        OutputError: matplotlib is not installed.
+    """
     try:
         import matplotlib
     except ImportError:
-        raise OutputError("figures need matplotlib: install warpflag with its extra, warpflag[plot]") from None
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    return plt
+        raise OutputError("figures need matplotlib: pip install 'warpflag[plot]'") from None
+    with matplotlib.rc_context(STYLE):
+        yield _figure_class()
 
 
-def _draw(axes: Any, runs: Sequence[Curves], name: str, dashed: Sequence[str] = ()) -> None:
-    for k, run in enumerate(runs):
-        style = "--" if run.label in dashed else "-"
-        axes.plot(run.times, getattr(run, name), style, color=COLORS[k % len(COLORS)], label=run.label)
-    axes.set_ylim(0.0, 1.05 if name == "bundle_length" else None)
+@cache
+def _figure_class() -> Any:
+    from matplotlib.figure import Figure
+
+    class NotebookFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            buffer = io.BytesIO()
+            self.savefig(buffer, format="png", dpi=150)
+            return buffer.getvalue()
+
+    return NotebookFigure
 
 
-def _inset(axes: Any, place: tuple[float, float, float, float], y: str) -> Any:
-    """Small axes over time inside others, on a white ground that holds their labels too."""
-    from matplotlib.patches import Rectangle
-
-    left, bottom, width, height = place
-    ground = Rectangle((left - 0.12, bottom - 0.14), width + 0.13, height + 0.16, transform=axes.transAxes)
-    ground.set(facecolor="white", edgecolor="none", zorder=2.4)  # above lines, below the frame
-    axes.add_patch(ground)
-    inset = axes.inset_axes(place, zorder=5)
-    inset.set_xlabel("t (ms)", fontsize=7, labelpad=1)
-    inset.set_ylabel(y, fontsize=7, labelpad=1)
-    inset.tick_params(labelsize=6, pad=1.5, length=2)
-    inset.set_xlim(*axes.get_xlim())
-    return inset
+def _title(curve: Curve) -> str:
+    """Name of a curve with its symbol in italics and its unit."""
+    symbols = {"⟨θ⟩": r"$\langle\theta\rangle$", "l_r": "$l_r$", "f_c": "$f_c$", "v": "$v$"}
+    parts = [curve.words, symbols.get(curve.symbol, curve.symbol), f"({curve.unit})" if curve.unit else ""]
+    return " ".join(filter(None, parts))
 
 
-def _legend(figure: Figure, axes: Any) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if len(labels) > 1:
-        room = 0.45 + 0.05 * max(map(len, labels))  # inches that an entry takes: handle and 7 point letters
-        columns = min(len(labels), max(1, int(figure.get_figwidth() / room)))
-        figure.legend(handles, labels, loc="outside upper center", ncols=columns, handlelength=1.8)
+def _set_range(axes: Any, found: Sequence[Curve]) -> None:
+    """A range that begins at 0 or below; a peak of few frames that would flatten the rest is told, not shown."""
+    values = np.concatenate([curve.values.ravel() for curve in found])
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return
+    low, high = np.minimum(values.min(), 0.0), np.maximum(values.max(), 0.0)
+    tail = 0.5 * (1.0 - _SHARE_IN_VIEW)
+    most_low, most_high = np.minimum(np.quantile(values, tail), 0.0), np.maximum(np.quantile(values, 1.0 - tail), 0.0)
+    beyond = []
+    if high > _PEAK * most_high > 0.0:
+        beyond, high = [f"up to {_short(high)}"], most_high
+    if low < _PEAK * most_low < 0.0:
+        beyond, low = [*beyond, f"down to {_short(low)}"], most_low
+    margin = 0.05 * (high - low) or 0.5
+    axes.set_ylim(low - margin if low < 0.0 else -0.4 * margin, high + margin)
+    if beyond:
+        axes.set_title(", ".join(beyond), loc="right", fontsize=7)
 
 
-def _strokes(record: Record, frame: int) -> tuple[Array, Array, list[str]]:
-    """Lines, widths [um] and colours of body and flagella, the farthest first; x to the rear, y along e_b1."""
-    e1, _, e3 = _body_axes(record.body_orientation[0])
-    view = np.stack([e3, e1, np.cross(e3, e1)])
-    half = (record.body_length - record.body_width) / 2
-    rear = _body_axes(record.body_orientation[frame])[2]
-    points = (record.positions[frame] - record.body_position[frame]) @ view.T
-    drawn = [(0.0, np.stack([-half * rear, half * rear])[:, :] @ view.T, record.body_width, "#b9bdb3")]
-    for k, rows in enumerate(flagella(record.first_node)):
-        for a, b in zip(points[rows][:-1], points[rows][1:], strict=True):
-            ends, depth = np.stack([a, b]), (a[2] + b[2]) / 2
-            # A white rim shows which of two flagella is in front.
-            drawn.append((depth - 1e-6, ends.mean(axis=0) + 0.2 * (ends - ends.mean(axis=0)), 0.16, "#ffffff"))
-            drawn.append((depth, ends, 0.08, COLORS[k % len(COLORS)]))
-    drawn.sort(key=lambda stroke: stroke[0])
-    lines = np.array([line[:, :2] for _, line, _, _ in drawn])
-    return lines, np.array([width for _, _, width, _ in drawn]), [color for *_, color in drawn]
+def _short(value: float) -> str:
+    """A number to three digits, without an exponent."""
+    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
-def _body_axes(quaternion: Array) -> Array:
-    """e_b1, e_b2, e_b3 in the lab as rows, of a quaternion (x, y, z, w)."""
-    x, y, z, w = unit(quaternion)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return (np.eye(3) + 2 * w * cross + 2 * cross @ cross).T
+def _set_times(panels: Sequence[Any], runs: Sequence[Run], lowest: Sequence[Any]) -> None:
+    """The range of times of all panels, and its label under the lowest."""
+    first, last = min(run.times[0] for run in runs), max(run.times[-1] for run in runs)
+    for axes in panels:
+        if last > first:
+            axes.set_xlim(first, last)
+    for axes in lowest:
+        axes.set_xlabel("t (ms)")
+
+
+def _styles(count: int, values: Sequence[float] | None) -> list[dict[str, Any]]:
+    """Colour and line of each run: along the colour map by a number where more than four differ in one alone."""
+    if values is not None and count > 4:
+        low, high = min(values), max(values)
+        shares = 0.85 * (np.array(values) - low) / ((high - low) or 1.0)  # the last colours are too pale on white
+        return [{"color": tuple(map_color(share) / 255.0)} for share in shares]
+    return [
+        {"color": COLORS[k % len(COLORS)], "linestyle": _LINE_STYLES[k // len(COLORS) % len(_LINE_STYLES)]}
+        for k in range(count)
+    ]

@@ -1,4 +1,4 @@
-"""Picture files: PNG by the standard library, animated WebP and GIF by Pillow, mp4 by ffmpeg."""
+"""Picture files: PNG and JPEG, animated WebP and GIF by Pillow, mp4 by ffmpeg; without Pillow, plain PNG."""
 
 from __future__ import annotations
 
@@ -16,65 +16,101 @@ from numpy.typing import NDArray
 
 from warpflag.base.output import OutputError, whole
 
-__all__ = ["ANIMATIONS", "check_writable", "write_animation", "write_png"]
+__all__ = ["ANIMATIONS", "PICTURES", "check_rate", "check_writable", "write_animation", "write_picture"]
 
 Picture = NDArray[np.uint8]
-
+"""sRGB, shape [height, width, 3]."""
+PICTURES = (".png", ".jpg", ".jpeg")
 ANIMATIONS = (".webp", ".gif", ".mp4")
 
+_FASTEST_GIF = 50.0  # pictures per second: browsers show a delay of one hundredth of a second as ten
 
-def write_png(path: Path, picture: Picture) -> None:
-    """Writes a picture, shape [height, width, 3]."""
+
+def write_picture(path: Path, picture: Picture) -> None:
+    """Writes a picture in the format of the path's ending; the file is whole or absent.
+
+    Raises:
+        OutputError: the package for this ending is missing.
+    """
+    with whole(path) as temporary:
+        try:
+            image = _pillow(path.suffix)
+        except OutputError:
+            if path.suffix != ".png":
+                raise
+            _write_plain_png(temporary, picture)
+        else:
+            image.fromarray(picture).save(temporary, **({} if path.suffix == ".png" else {"quality": 92}))
+
+
+def _write_plain_png(path: Path, picture: Picture) -> None:
+    """Writes a PNG with the standard library, its rows unfiltered: larger than Pillow's, and the same pixels."""
     height, width = picture.shape[:2]
-    raw = picture.astype(np.int16)
-    left, above, corner = np.zeros_like(raw), np.zeros_like(raw), np.zeros_like(raw)
-    left[:, 1:], above[1:], corner[1:, 1:] = raw[:, :-1], raw[:-1], raw[:-1, :-1]
-    guess = left + above - corner
-    to_left, to_above, to_corner = (abs(guess - other) for other in (left, above, corner))
-    paeth = np.where(
-        (to_left <= to_above) & (to_left <= to_corner), left, np.where(to_above <= to_corner, above, corner)
-    )
-    filters = (0, 1, 2, 4)
-    rests = np.stack([(raw - base).astype(np.uint8).reshape(height, -1) for base in (0, left, above, paeth)])
-    # The usual choice per row: the filter that leaves the smallest rests.
-    chosen = abs(rests.view(np.int8).astype(np.int32)).sum(axis=2).argmin(axis=0)
-    rows = np.hstack([np.take(filters, chosen)[:, None].astype(np.uint8), rests[chosen, np.arange(height)]])
+    rows = np.hstack([np.zeros((height, 1), np.uint8), picture.reshape(height, -1)])
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
-        (b"sRGB", b"\0"),
         (b"IDAT", zlib.compress(rows.tobytes(), 6)),
         (b"IEND", b""),
     )
-    with whole(path) as temporary, temporary.open("wb") as file:
+    with path.open("wb") as file:
         file.write(b"\x89PNG\r\n\x1a\n")
         for kind, data in chunks:
             file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
 
 
 def check_writable(path: Path) -> None:
-    """Raises OutputError where nothing here writes pictures or animations of that ending."""
+    """Checks that pictures or films of the path's ending can be written.
+
+    Raises:
+        OutputError: they can't; it says what to install.
+    """
     if path.suffix == ".mp4":
         _ffmpeg()
-    elif path.suffix in ANIMATIONS:
+    elif path.suffix in ANIMATIONS or path.suffix in PICTURES[1:]:
         _pillow(path.suffix)
     elif path.suffix != ".png":
-        raise OutputError(f"{path}: a picture must end in .png, a film in {', '.join(ANIMATIONS)}")
+        raise OutputError(f"{path}: a picture must end in {', '.join(PICTURES)}, a film in {', '.join(ANIMATIONS)}")
 
 
-def write_animation(path: Path, pictures: Iterator[Picture], count: int, seconds: float) -> None:
-    """Writes a film of `count` pictures, shape [height, width, 3], that stand for `seconds` each.
+def check_rate(path: Path, rate: float) -> None:
+    """Checks that a film of the path's ending can show so many pictures per second.
 
-    WebP and GIF repeat it for ever. Pictures are taken one at a time, as they are needed. Raises OutputError where
-    the program or package for this ending is missing, OSError where it fails.
+    Raises:
+        OutputError: it can't.
     """
+    if path.suffix == ".gif" and rate > _FASTEST_GIF:
+        raise OutputError(f"{path}: a GIF shows at most {_FASTEST_GIF:g} pictures per second, not {rate:g}")
+
+
+def write_animation(path: Path, pictures: Iterator[Picture], count: int, rate: float) -> None:
+    """Writes a film; WebP and GIF repeat it for ever. The file is whole or absent.
+
+    Args:
+        path: its ending says the format.
+        pictures: all of the same shape; they are taken one at a time, as they are needed.
+        count: how many there are.
+        rate: pictures per second.
+
+    Raises:
+        OutputError: the program or package for this ending is missing, or the format has no such rate.
+        OSError: it fails.
+    """
+    check_rate(path, rate)
     with whole(path) as temporary:
         if path.suffix == ".mp4":
-            _write_mp4(temporary, pictures, seconds)
+            _write_mp4(temporary, pictures, rate)
         else:
             # Every picture whole: differences between lossy pictures leave smudges on a plain background.
             options = {"quality": 90, "method": 4, "kmin": 0, "kmax": 1} if path.suffix == ".webp" else {}
             reel = _reel(_pillow(path.suffix), pictures, count)
-            reel.save(temporary, save_all=True, duration=1e3 * seconds, loop=0, **options)
+            reel.save(temporary, save_all=True, duration=_delays(path.suffix, count, rate), loop=0, **options)
+
+
+def _delays(suffix: str, count: int, rate: float) -> list[int]:
+    """How long each picture stands [ms], in the steps that the format has, so that the whole keeps its length."""
+    step = 10 if suffix == ".gif" else 1
+    ends = np.rint(1e3 / step / rate * np.arange(count + 1)).astype(int) * step
+    return np.diff(ends).tolist()
 
 
 def _pillow(suffix: str) -> Any:
@@ -111,6 +147,7 @@ def _reel(image: Any, pictures: Iterator[Picture], count: int) -> Any:
 
 
 def _ffmpeg() -> str:
+    """Path of the program ffmpeg."""
     found = shutil.which("ffmpeg")
     if found:
         return found
@@ -121,24 +158,24 @@ def _ffmpeg() -> str:
     return get_ffmpeg_exe()
 
 
-def _write_mp4(path: Path, pictures: Iterator[Picture], seconds: float) -> None:
+def _write_mp4(path: Path, pictures: Iterator[Picture], rate: float) -> None:
     first = next(pictures)
     height, width = first.shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{1 / seconds:.6f}", "-i", "-"]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{rate:.6f}", "-i", "-"]
     # Widely played: H.264 in 4:2:0, which takes even sizes only.
     coding = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18"]
     command = [_ffmpeg(), "-loglevel", "error", "-y", *source, *coding, "-movflags", "+faststart", str(path)]
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=said)
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=output)
         assert process.stdin is not None
         try:
             for picture in (first, *pictures):
                 process.stdin.write(picture.tobytes())
         except BrokenPipeError:
-            pass  # its status and its words tell why
+            pass  # its exit status and its error output tell why
         finally:
             process.stdin.close()
             status = process.wait()
         if status != 0:
-            said.seek(0)
-            raise OSError(f"{path}: ffmpeg failed: {' '.join(said.read().decode(errors='replace').split())}")
+            output.seek(0)
+            raise OSError(f"{path}: ffmpeg failed: {' '.join(output.read().decode(errors='replace').split())}")

@@ -1,7 +1,7 @@
 """What a movie colours the nodes by, from the record alone: curvature, phase difference, contact load.
 
-Functions take blocks of frames: positions [um] and directors e1, shape [frame, node, 3], flagellum after flagellum,
-and `first_node`, shape [flagellum_count + 1]. They return a value per node, shape [frame, node].
+Functions take blocks of frames, flagellum after flagellum; flagellum k has the nodes first_node[k] to
+first_node[k + 1] - 1.
 """
 
 from __future__ import annotations
@@ -22,9 +22,17 @@ _LINEAR_BELOW = 0.7
 
 
 def curvature(positions: Array, first_node: NDArray[np.integer]) -> Array:
-    """Curvature of the centre line [1/um]: |kb| of discrete elastic rods over the mean length of the two segments.
+    """Curvature of the centre line at the nodes [1/um], shape [frame, node].
 
-    The ends of a flagellum have no joint and take their neighbour's value.
+    It is |kb| of discrete elastic rods over the mean length of the two segments at a node. The ends of a flagellum have
+    no joint and take their neighbour's value.
+
+    Args:
+        positions: nodes [um], shape [frame, node, 3].
+        first_node: shape [flagellum_count + 1].
+
+    Source:
+        Bergou et al., Discrete elastic rods, ACM Trans. Graph. 27, 63 (2008), eq. (1).
     """
     values = np.empty(positions.shape[:2])
     for first, end in pairwise(first_node):
@@ -39,11 +47,16 @@ def curvature(positions: Array, first_node: NDArray[np.integer]) -> Array:
 
 
 def nearest_phase_difference(positions: Array, directors: Array, first_node: NDArray[np.integer]) -> Array:
-    """Local phase difference theta(i) in [0, 1] of each segment with the same one of the nearest other flagellum.
+    """Local phase difference theta(i) in [0, 1] of each node with the nearest other flagellum, shape [frame, node].
 
     Nearest is the flagellum whose node of the same number is; segments are paired by their number from the motor,
     as the paper does. Node i takes the value of segment i, r_0 that of segment 1. NaN where there is no other
     flagellum of that length, or where the tangents are antiparallel.
+
+    Args:
+        positions: nodes [um], shape [frame, node, 3].
+        directors: e1 of motor tripod and segments, shape [frame, node, 3].
+        first_node: shape [flagellum_count + 1].
     """
     first_node = np.asarray(first_node)
     counts = np.diff(first_node)
@@ -75,14 +88,20 @@ def nearest_phase_difference(positions: Array, directors: Array, first_node: NDA
 
 
 def contact_load(positions: Array, first_node: NDArray[np.integer], strength: float, diameter: float) -> Array:
-    """Steric load of each node [pN]: its shares of |F| from every contact between segments of different flagella.
+    """Steric load of each node [pN], shape [frame, node].
+
+    It is the node's shares of |F| from every contact between segments of different flagella.
 
     The force of the simulation (kernels: steric): F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, along its
     tangent below 0.7 sigma, r the least distance of two segments; at parameter t of a segment it acts by 1 - t on
     the first and t on the second node. Every contact counts on both sides, so a frame's sum is twice the recorded
     steric force.
 
-    strength: F_0 [pN]. diameter: sigma [um].
+    Args:
+        positions: nodes [um], shape [frame, node, 3].
+        first_node: shape [flagellum_count + 1].
+        strength: F_0 [pN].
+        diameter: sigma [um].
     """
     frames, nodes = positions.shape[:2]
     is_segment = np.ones(nodes, dtype=bool)
@@ -102,19 +121,25 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
 
 
 def _steric_force(x: Array, strength: float) -> Array:
-    """The repulsion at distance x in units of sigma [pN]."""
+    """The steric force at distances x in units of sigma [pN]."""
     y = 1.0 / np.maximum(x, _LINEAR_BELOW)
     force = 2.0 * y**13 - y**7 + (26.0 * y**14 - 7.0 * y**8) * np.maximum(_LINEAR_BELOW - x, 0.0)
     return np.where(x < _CUTOFF, strength * force, 0.0)
 
 
 def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tuple[NDArray, NDArray]:
-    """Pairs of one frame's points nearer than `reach`, of different groups, each once; indices frame * count + point.
+    """Pairs of points of one frame that are near each other and of different groups, each pair once.
 
-    points: shape [frame, count, 3]. group: shape [count].
-
-    Points are sorted by cell of a grid of that width; z is its fastest index, so that the cells above and below
+    Points are sorted by cell of a grid as wide as the reach; z is its fastest index, so that the cells above and below
     are one range of the sorted points, and five ranges hold every neighbour once.
+
+    Args:
+        points: [um], shape [frame, count, 3].
+        reach: distance below which two points are near [um].
+        group: shape [count].
+
+    Returns:
+        Indices frame * count + point of the first and of the second of every pair.
     """
     frames, count = points.shape[:2]
     frame = np.repeat(np.arange(frames), count)

@@ -1,4 +1,4 @@
-"""From rods and a camera to a picture: the arrays and the light that the ray caster's kernels take."""
+"""A picture of rods as a camera sees them, drawn by the ray caster of the kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpflag.view.coloring import linear
-from warpflag.view.usd_read import Camera, Rods
+from warpflag.view.usd.read import Camera, Rods
 
 __all__ = ["draw"]
 
@@ -22,10 +22,14 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 def draw(
     rods: Rods, camera: Camera, light: tuple[Array, float], size: tuple[int, int], device: Any
 ) -> NDArray[np.uint8]:
-    """A picture, sRGB, shape [height, width, 3].
+    """A picture in sRGB, shape [height, width, 3].
 
-    light: the unit vector toward it and half the angle under which it is seen [rad]. size: width and height [pixels];
-    where it has other proportions than the camera, more is seen. device: Warp's device.
+    Args:
+        rods: what is drawn.
+        camera: that sees them.
+        light: unit vector toward the light, and half the angle under which it is seen [rad].
+        size: width and height [pixels]; where they have other proportions than the camera, more is seen.
+        device: Warp's device.
     """
     import warp as wp
     from warpflag_kernels.picture import raycast
@@ -66,7 +70,12 @@ def draw(
 
 
 def seen(camera: Camera, size: tuple[int, int]) -> tuple[float, float]:
-    """Tangents of half the angles of view across and up, widened to the proportions of the picture."""
+    """Tangents of half the angles of view across and up, widened to the proportions of a picture.
+
+    Args:
+        camera: whose view is widened.
+        size: width and height of the picture [pixels].
+    """
     across, above = camera.tangents
     proportion = size[0] / size[1]
     return max(across, above * proportion), max(above, across / proportion)

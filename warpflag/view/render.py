@@ -7,9 +7,11 @@ the picture says by how much. The scale bar holds at the distance of the middle 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +20,25 @@ from warpflag.base.device import find_device
 from warpflag.base.output import OutputError
 from warpflag.base.progress import Progress
 from warpflag.record import Record
-from warpflag.view.coloring import map_color
-from warpflag.view.images import check_writable, write_animation, write_png
-from warpflag.view.lettering import draw_strokes, draw_text, text_width
+from warpflag.view.coloring import DISPLAY_RADIUS
+from warpflag.view.images import PICTURES, check_rate, check_writable, write_animation, write_picture
+from warpflag.view.notes import Pen, can_write
 from warpflag.view.raycaster import draw, seen
 from warpflag.view.usd import Shot, movie_stage
-from warpflag.view.usd_read import Film
+from warpflag.view.usd.read import Film
 
-__all__ = ["DISPLAY_RADIUS", "Renderer", "render"]
+__all__ = ["Renderer", "render"]
 
-DISPLAY_RADIUS = 0.05
-"""Of the flagella in pictures, where they are thinner [um]."""
 MOVIE_NAME = "movie.usdc"
 
 _THINNEST = 1.5  # pixels, least radius of a flagellum in a picture
-_INK = (38, 50, 63)
-_FAINT = (112, 124, 138)
-_LENGTHS = [base * 10.0**power for power in range(-3, 4) for base in (1, 2, 5)]  # um, of scale bars
 _LEGEND_ROOM = 30  # heights of a letter: a narrower picture has the scale bar only
 _GUTTER = 3  # pixels between the snapshots of a sheet
 
 
 @dataclass(frozen=True)
 class _Notes:
-    """What is written on a picture."""
+    """Which notes are written on a picture: the simulated time; scale bar and legend."""
 
     time: bool = True
     scale: bool = True
@@ -50,8 +47,11 @@ class _Notes:
 class Renderer:
     """Draws pictures of a film.
 
-    size: width and height [pixels]. radius: least radius of curves [um], but never below 1.5 pixels. device: that
-    draws, None for Warp's preferred one.
+    Args:
+        film: to be drawn.
+        size: width and height [pixels].
+        radius: least radius of flagella and spokes [um]; they are never thinner than 3 pixels.
+        device: Warp's device that draws; None for Warp's preferred one.
     """
 
     def __init__(
@@ -64,23 +64,32 @@ class Renderer:
     def picture(
         self, code: float, notes: _Notes | None = None, size: tuple[int, int] | None = None
     ) -> NDArray[np.uint8]:
-        """The picture at a time code, sRGB, shape [height, width, 3]."""
+        """The picture at a time code, sRGB, shape [height, width, 3]; without notes where Pillow is missing."""
         notes, size = notes or _Notes(), size or self.size
         camera = self.film.camera(code)
         pixel = 2.0 * camera.focus * seen(camera, size)[0] / size[0]  # um
         radius = max(self._radius, _THINNEST * pixel)
         picture = draw(self.film.rods(code, radius), camera, self.film.light(code), size, self._device)
+        if not can_write():
+            return picture
         letter = max(8.0, 0.024 * min(size))
+        pen = Pen(picture, letter)
         if notes.time:
-            _write_time(picture, self.film.time(code), letter)
+            pen.write_time(self.film.time(code))
         if notes.scale:
-            _draw_scale(picture, pixel, letter)
+            pen.draw_scale(pixel)
             if size[0] > _LEGEND_ROOM * letter:
-                _draw_legend(picture, self.film, radius, letter)
-        return picture
+                facts = self.film.facts
+                factor = radius / self.film.thinnest()
+                pen.write_legend(factor, facts.get("colorLabel", ""), facts.get("colorHighest", 0.0))
+        return pen.picture
 
     def sheet(self, codes: Sequence[float], progress: Progress) -> NDArray[np.uint8]:
-        """Snapshots at time codes in rows, all at one scale; the last one has the scale bar."""
+        """Snapshots at time codes in rows, all at one scale; the last one has the scale bar.
+
+        Raises:
+            OutputError: they do not fit into the picture.
+        """
         columns, rows = _grid(len(codes), self.film.camera(codes[0]).tangents, self.size)
         width, height = ((whole - (n - 1) * _GUTTER) // n for whole, n in zip(self.size, (columns, rows), strict=True))
         if min(width, height) < 32:
@@ -114,15 +123,25 @@ def render(
     device: str | None = None,
     quiet: bool = True,
 ) -> None:
-    """Draws a run or a movie into a picture (.png) or a film (.webp, .gif, .mp4); the file is whole or absent.
+    """Draws a run or a movie into a picture (.png, .jpg) or a film (.webp, .gif, .mp4); the file is whole or absent.
 
-    source: a run directory or a movie file. A directory's movie.usdc is drawn as it is, or filmed anew where there is
-    none or a `shot` is given. times: of a picture [s]; several, or `snapshots` spread evenly over the movie, make a
-    sheet; none is the last frame. frames_per_second: of a film; None: the movie's own. The other arguments: see
-    `Renderer`. quiet: without a progress bar.
+    Args:
+        source: a run directory or a movie file. A directory's movie.usdc is drawn as it is, or filmed anew where there
+            is none or a `shot` is given.
+        output: the file; its ending says the format.
+        shot: how a directory is filmed anew.
+        times: of a picture [s]; several make a sheet, none is the last frame.
+        snapshots: a sheet of so many pictures spread evenly over the movie.
+        frames_per_second: of a film; None for the movie's own.
+        size: width and height [pixels].
+        radius: least radius of flagella and spokes [um]; they are never thinner than 3 pixels.
+        device: Warp's device that draws; None for Warp's preferred one.
+        quiet: say nothing of how long the film will be, and show no progress.
 
-    Raises OutputError for what can't be drawn, RecordError for a directory without a record, OSError where the file
-    can't be written.
+    Raises:
+        OutputError: what can't be drawn.
+        RecordError: a directory without a record.
+        OSError: the file can't be written.
     """
     output = Path(output)
     check_writable(output)
@@ -131,29 +150,43 @@ def render(
             raise OutputError(f"{name} {value:g}: must be positive and finite")
     if min(size) < 32 or max(size) > 16384:
         raise OutputError(f"size {size[0]}x{size[1]}: 32 to 16384 pixels a side are allowed")
-    is_film = output.suffix != ".png"
+    is_film = output.suffix not in PICTURES
     if is_film and (times or snapshots is not None):
-        raise OutputError(f"{output}: times and snapshots are for pictures, .png")
+        raise OutputError(f"{output}: times and snapshots are for pictures, {', '.join(PICTURES)}")
     film = _film(Path(source), shot)
     renderer = Renderer(film, size, radius, device)
     rate = frames_per_second or film.frames_per_second
     if is_film:
+        check_rate(output, rate)
         codes = np.arange(film.start, film.end + 1e-6, film.codes_per_second / rate).tolist()
     else:
         codes = _snapshot_codes(film, times, snapshots)
+    if is_film and not quiet:
+        seconds = len(codes) * _seconds_per_picture(renderer, codes)
+        film_length = f"{len(codes)} pictures of {size[0]}x{size[1]}, a film of {len(codes) / rate:.1f} s"
+        print(f"{output}: {film_length}; drawing it takes about {seconds:.0f} s", file=sys.stderr)
     progress = Progress(film.time(codes[-1]), quiet=quiet or len(codes) == 1)
     try:
         if is_film:
-            write_animation(output, renderer.pictures(codes, progress), len(codes), 1.0 / rate)
+            write_animation(output, renderer.pictures(codes, progress), len(codes), rate)
         elif len(codes) > 1:
-            write_png(output, renderer.sheet(codes, progress))
+            write_picture(output, renderer.sheet(codes, progress))
         else:
-            write_png(output, renderer.picture(codes[0]))
+            write_picture(output, renderer.picture(codes[0]))
     finally:
         progress.close()
 
 
+def _seconds_per_picture(renderer: Renderer, codes: Sequence[float]) -> float:
+    """Time that a picture takes [s], measured on the last one after the first, which may compile kernels."""
+    renderer.picture(codes[0])
+    start = monotonic()
+    renderer.picture(codes[-1])
+    return monotonic() - start
+
+
 def _snapshot_codes(film: Film, times: Sequence[float], snapshots: int | None) -> list[float]:
+    """Time codes of the pictures that are asked for."""
     if snapshots is None:
         return [film.code_at(time) for time in times] or [film.end]
     if snapshots < 1 or times:
@@ -162,6 +195,7 @@ def _snapshot_codes(film: Film, times: Sequence[float], snapshots: int | None) -
 
 
 def _film(source: Path, shot: Shot | None) -> Film:
+    """The movie of a file, of a directory, or one filmed anew from its record."""
     if source.suffix.startswith(".usd"):
         if shot is not None:
             raise OutputError(f"{source}: has its own colours and camera; name the run directory to film it anew")
@@ -181,45 +215,3 @@ def _grid(count: int, tangents: tuple[float, float], size: tuple[int, int]) -> t
 
     columns = max(range(1, count + 1), key=scale)
     return columns, -(-count // columns)
-
-
-def _write_time(picture: NDArray[np.uint8], time: float, letter: float) -> None:
-    draw_text(picture, f"{1e3 * time:.2f} ms", (1.4 * letter, 2.6 * letter), 1.2 * letter, _INK)
-
-
-def _draw_scale(picture: NDArray[np.uint8], pixel: float, letter: float) -> None:
-    """A bar of 1, 2 or 5 um or powers of ten of them, about an eighth of the picture wide, in the lower right corner.
-
-    pixel: width of one [um].
-    """
-    height, width = picture.shape[:2]
-    length = min(_LENGTHS, key=lambda length: abs(np.log(length / (0.125 * width * pixel))))
-    right, bottom = width - 1.6 * letter, height - 1.6 * letter
-    left = right - length / pixel
-    draw_strokes(picture, [np.array([[left, bottom], [right, bottom]])], 0.32 * letter, _INK)
-    text = f"{length:g} µm"
-    place = (0.5 * (left + right - text_width(text, letter)), bottom - 0.8 * letter)
-    draw_text(picture, text, place, letter, _INK)
-
-
-def _draw_legend(picture: NDArray[np.uint8], film: Film, radius: float, letter: float) -> None:
-    """By how much the flagella are thickened, and what the colours mean, in the lower left corner."""
-    x, y, small = 1.4 * letter, picture.shape[0] - 1.6 * letter, 0.75 * letter
-    factor = radius / film.thinnest()
-    if factor > 1.05:
-        draw_text(picture, f"flagella drawn {_short(factor)}x thicker", (x, y), small, _FAINT)
-        y -= 2.2 * letter
-    label, highest = film.facts.get("colorLabel"), film.facts.get("colorHighest")
-    if label and highest:
-        ticks, width, height = ("0", _short(highest)), round(9 * letter), round(0.7 * letter)
-        x += text_width(ticks[0], small) + 0.6 * letter
-        row, column = round(y - 0.7 * letter), round(x)
-        picture[row : row + height, column : column + width] = map_color(np.linspace(0.0, 1.0, width))
-        draw_text(picture, ticks[0], (1.4 * letter, y), small, _INK)
-        draw_text(picture, ticks[1], (x + width + 0.6 * letter, y), small, _INK)
-        draw_text(picture, label, (1.4 * letter, y - 1.5 * letter), small, _INK)
-
-
-def _short(value: float) -> str:
-    """A positive number to two digits, in the letters there are."""
-    return np.format_float_positional(float(f"{value:.2g}"), trim="-")

@@ -5,6 +5,9 @@ as with the local one, since filaments side by side drag each other along. With 
 over-implicitness w, a step of two iterations multiplies such a mode by (1 - kappa/w)^2, so w must exceed kappa/2.
 kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
 product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
+
+The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
+in flexible crowds; where kappa is large, in stiff cells, the equations are solved with the full mobility (`krylov`).
 """
 
 import functools
@@ -19,14 +22,21 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.implicit import linear_system, linearised
 from warpflag_kernels.rod import chain_chart
 
-LEAST = 1.3  # least over-implicitness, and that of one or two flagella, whose kappa is not measured
+LEAST = 1.3  # least over-implicitness, and that of one or two flagella
 OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
 # The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
 # approaches the eigenvalue from below.
 LARGEST_FALL = 0.985
 MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
+LARGE_KAPPA = 2.6  # twice LEAST, the limit of stability: from there on the full mobility is solved with
+LARGE_KAPPA_OF_CROWDS = 3.7  # the same for three flagella or more: eight flexible ones reach 3.5
+FREE_ROD = (
+    4.730041  # first root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4)
+)
+RELAXED = 0.1  # of such a decay time: a crowd whose steps are longer counts as stiff, not as flexible
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
+LONG_INTERVAL = 16  # the same for one or two flagella of small kappa
 
 
 @functools.cache
@@ -41,6 +51,8 @@ def struct(p: Precision) -> Any:
         active: wp.array(dtype=wp.int32)  # copy of `State.active`, which is masked during a measurement
         due: wp.array(dtype=wp.int32)  # [1], 1: some cell is measured in this pass
         probe: Increment  # of the power iteration, unit length
+        strong: wp.array(dtype=wp.int32)  # 1: kappa is large, the equations are solved with the full mobility
+        any_strong: wp.array(dtype=wp.int32)  # [1], 1: some cell's is
         size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part of a product
 
     return Stability
@@ -53,8 +65,9 @@ def allocate(model: DeviceModel) -> Any:
     s = struct(model.precision)()
     s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
     s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
-    s.measured, s.active = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
-    s.due = wp.ones(1, dtype=wp.int32, device=device)  # its kernels load in the first pass, which takes no step
+    s.measured, s.active, s.strong = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(3))
+    # Conditional kernels load in the first pass, which takes no step.
+    s.due, s.any_strong = (wp.ones(1, dtype=wp.int32, device=device) for _ in range(2))
     nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
     probe = chain_chart.allocate(model)
     probe.node.assign(np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes]))
@@ -68,6 +81,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
+    long_interval = wp.constant(LONG_INTERVAL)
+    large_kappa, large_kappa_of_crowds = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_CROWDS))
+    free_rod, relaxed = wp.constant(real(FREE_ROD**2)), wp.constant(wp.float64(RELAXED))
     least, most, share, fall = (
         wp.constant(wp.float64(x)) for x in (LEAST, MOST, OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL)
     )
@@ -87,8 +103,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         stability.active[c] = state.active[c]
         measured = int(0)
         crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-        due = steps[c] < first_measurements or steps[c] % interval == 0 or accepted[c] == 0
-        if crowd and state.active[c] != 0 and due:
+        wait = wp.where(crowd or stability.kappa[c] > large_kappa, interval, long_interval)
+        due = steps[c] < first_measurements or steps[c] % wait == 0 or accepted[c] == 0
+        if state.active[c] != 0 and due:
             measured = 1
             stability.due[0] = 1
         stability.measured[c] = measured
@@ -131,12 +148,28 @@ def _kernels(p: Precision) -> SimpleNamespace:
             e += 1
         stability.size[k] = total
 
+    @wp.func(module=module)
+    def rod_like(model: Model, c: wp.int32, step: wp.float64):
+        """Whether the longest bending mode of some flagellum relaxes within some ten steps."""
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            first = model.first_node[k]
+            h = model.rod.segment_length[k]
+            length = real(model.first_node[k + 1] - first - 1) * h
+            squared = free_rod / (length * length)
+            rate = model.rod.bending_rigidity[k] * h * model.drag.mobility_across[first + 1] * squared * squared
+            if step * wp.float64(rate) > relaxed:
+                return True
+            k += 1
+        return False
+
     @wp.kernel(module=module)
     def choose(
         # Model:
         model: Model,
         # State:
         answer: Increment,
+        step: wp.array(dtype=wp.float64),
         # Out:
         stability: Stability,
         over_implicit: wp.array(dtype=wp.float64),
@@ -155,7 +188,15 @@ def _kernels(p: Precision) -> SimpleNamespace:
         ratio = wp.sqrt(total)
         if wp.isfinite(ratio) and ratio > wp.float64(0.0):
             stability.kappa[c] = ratio * over_implicit[c]
-            over_implicit[c] = wp.clamp(share * stability.kappa[c], wp.max(least, fall * over_implicit[c]), most)
+            crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2 and not rod_like(model, c, step[c])
+            kappa = stability.kappa[c]
+            stability.strong[c] = wp.where(kappa > wp.where(crowd, large_kappa_of_crowds, large_kappa), 1, 0)
+            if stability.strong[c] != 0:
+                stability.any_strong[0] = 1
+            if crowd and stability.strong[c] == 0:
+                over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
+            else:
+                over_implicit[c] = least
             scale = real(wp.float64(1.0) / ratio)
             stability.probe.body[c] = scale * answer.body[c]
             e = model.first_node[model.first_flagellum[c]]
@@ -186,7 +227,6 @@ def measure(
     state: DeviceState,
     stiffness: Any,
     band: Any,
-    flow: Any,
     gain: wp.array,
     answer: Any,
     stability: Any,
@@ -201,9 +241,9 @@ def measure(
     """
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
-    linearised.apply(model, state, stiffness, band, flow, gain, stability.probe, answer)
+    linearised.apply(model, state, stiffness, band, gain, stability.probe, answer)
     linear_system.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
-    inputs = [model.data, answer, stability, over_implicit, state.data]
+    inputs = [model.data, answer, band.step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)

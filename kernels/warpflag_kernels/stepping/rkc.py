@@ -100,14 +100,11 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
     chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
-    damping = wp.constant(wp.float64(DAMPING))
-    probe_size = wp.constant(wp.float64(PROBE_SIZE[p.name]))
-    safety = wp.constant(wp.float64(SAFETY))
+    damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, SAFETY, PROBE_SIZE[p.name]))
     weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
     rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
-    stage_factor = wp.constant(wp.float64(STAGE_FACTOR))
+    stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
     epsilon = wp.constant(real(EPSILON[p.name]))
-    most_stages = wp.constant(wp.float64(MOST_STAGES))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
 

@@ -1,4 +1,4 @@
-"""What the usual validators of USD files leave unsaid: a movie that opens and does not play, or shows the wrong thing.
+"""Faults of a movie that the usual validators of USD files pass: it opens and does not play, or shows wrong things.
 
 `pxr.UsdValidation` and usd-validation-nvidia pass files with impossible time ranges, counts that do not fit their
 points, unknown tokens and misspelt types. These checks look at every time sample of every attribute.
@@ -13,13 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.view.usd_read import opened
+from warpflag.view.usd.read import opened
 
 __all__ = ["problems", "problems_of"]
 
 
 def problems_of(path: str) -> list[str]:
-    """What is wrong with a USD file, by these checks and by those that come with USD."""
+    """What is wrong with a USD file, by these checks and by those that come with USD, a line each.
+
+    Raises:
+        OutputError: it can't be read.
+    """
     from pxr import UsdValidation
 
     stage = opened(path)
@@ -29,7 +33,7 @@ def problems_of(path: str) -> list[str]:
 
 
 def problems(stage: Any) -> list[str]:
-    """What is wrong with a stage, a line each, told once for all time samples; nothing where it is sound."""
+    """What is wrong with a stage, a line each, once for all time samples; empty where it is sound."""
     from pxr import UsdGeom
 
     found = _stage_problems(stage)
@@ -46,6 +50,7 @@ def problems(stage: Any) -> list[str]:
 
 
 def _stage_problems(stage: Any) -> list[str]:
+    """Times, units, default prim, camera and files that are referred to."""
     from pxr import UsdGeom, UsdUtils
 
     found = []
@@ -68,7 +73,7 @@ def _stage_problems(stage: Any) -> list[str]:
 
 
 def _attribute_problems(attribute: Any, stage: Any) -> list[str]:
-    """Of the times of its samples, and of every value: tokens that it knows, numbers that are finite."""
+    """Times of the samples outside those of the stage, unknown tokens and numbers that are not finite."""
     path, allowed = attribute.GetPath(), attribute.GetMetadata("allowedTokens")
     times = attribute.GetTimeSamples()
     found = []
@@ -86,6 +91,7 @@ def _attribute_problems(attribute: Any, stage: Any) -> list[str]:
 
 
 def _is_finite(value: Any) -> bool:
+    """Whether all numbers of a value are finite; true for what holds none."""
     try:
         return bool(np.isfinite(np.asarray(value, dtype=float)).all())
     except (TypeError, ValueError):  # no numbers
@@ -93,7 +99,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _curve_problems(curves: Any) -> list[str]:
-    """Of counts that do not add up to the points, and primvars of the wrong length, at every time sample."""
+    """Counts that do not add up to the points, and primvars of the wrong length, at every time sample."""
     from pxr import UsdGeom
 
     found, path = [], curves.GetPath()
@@ -113,6 +119,7 @@ def _curve_problems(curves: Any) -> list[str]:
 
 
 def _extent_problems(boundable: Any) -> list[str]:
+    """Extents that are not the bounds of what is shown, at every time sample."""
     from pxr import UsdGeom
 
     found, extent = [], boundable.GetExtentAttr()

@@ -4,12 +4,12 @@ Units and time: 1 scene unit is 1 um (metersPerUnit 1e-6), z is up, time code = 
 film is slower than the cell by the factor in customLayerData; the simulated time is a custom attribute of the cell.
 
     /World         assembly
-    /World/Cell    what `warpflag.usd_cell` describes; of several records Cell_0, Cell_1, ... side by side
+    /World/Cell    what `warpflag.view.usd.cell` describes; of several records Cell_0, Cell_1, ... side by side
     /World/Camera  holds the whole path in view, or follows the cell
     /World/Lights
 
-The points have the order of the record's nodes. What outgrows 256 MiB is written as value clips, files of so many
-frames each in the folder NAME.usdc.clips beside the movie; a program that opens the movie finds them.
+The points have the order of the record's nodes. A movie of more than 256 MiB is written as value clips, files of so
+many frames each in the folder NAME.usdc.clips beside it; a program that opens the movie finds them.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
@@ -31,8 +31,9 @@ from warpflag.base.output import OutputError, whole
 from warpflag.record import Record, RecordError
 from warpflag.scene import loads
 from warpflag.view.coloring import QUANTITIES
-from warpflag.view.usd_cell import Cell
-from warpflag.view.usd_shot import Extent, add_camera, add_lights, arranged, steady_path, view_axes
+from warpflag.view.usd.camera import Extent, add_camera, add_lights, arranged, steady_path, view_axes
+from warpflag.view.usd.cell import Cell
+from warpflag.view.usd.mesh_cell import MeshCell
 
 __all__ = ["Shot", "movie_stage", "write_movie"]
 
@@ -40,17 +41,23 @@ SUFFIXES = (".usdc", ".usda", ".usdz")
 _CLIP_BYTES = 1 << 28
 _BLOCK_BYTES = 1 << 21
 _BYTES_PER_NODE = 28  # point, colour and raw value
+_BYTES_PER_MESH_NODE = 16 * (28 + 12)  # two rings of eight vertices, each with its normal
 
 
 @dataclass(frozen=True)
 class Shot:
     """How a record is filmed.
 
-    color_by: flagellum, phase_difference, curvature or steric_force. follow: the camera goes with the cell.
-    frames_per_second: of the film. slow_down: how much slower than the cell it plays; None: one frame of the record
-    per frame of the film. clip_frames: frames per value clip; None: one file as long as its samples fit in 256 MiB.
+    Attributes:
+        color_by: flagellum, phase_difference, curvature or steric_force.
+        follow: whether the camera goes with the cell.
+        frames_per_second: of the film.
+        slow_down: how many times slower than the cell the film plays; None: a frame of it per frame of the record.
+        clip_frames: frames per value clip; None: one file as long as its samples fit in 256 MiB.
+        mesh: whether body, flagella and motors are meshes, see `warpflag.view.usd.mesh_cell`.
 
-    Raises OutputError for values that make no film.
+    Raises:
+        OutputError: values that make no film.
     """
 
     color_by: str = "flagellum"
@@ -58,6 +65,7 @@ class Shot:
     frames_per_second: float = 50.0
     slow_down: float | None = None
     clip_frames: int | None = None
+    mesh: bool = False
 
     def __post_init__(self) -> None:
         if self.color_by not in QUANTITIES:
@@ -69,12 +77,17 @@ class Shot:
 
 
 def write_movie(records: Record | Sequence[Record], path: str | Path, shot: Shot | None = None) -> None:
-    """Writes the movie of a record, or of several cells side by side; `path` is whole or absent.
+    """Writes the movie of a record, or of several cells side by side; the file is whole or absent.
 
-    path: ends in .usdc, .usda (text) or .usdz (one file that phones and web viewers open).
+    Args:
+        records: the run, or several.
+        path: ends in .usdc, .usda (text) or .usdz (one file that phones and web viewers open).
+        shot: how it is filmed; None for the defaults.
 
-    Raises RecordError for records without frames or with unequal frame intervals, OutputError for another ending,
-    OSError where the file can't be written.
+    Raises:
+        RecordError: records without frames or with unequal frame intervals.
+        OutputError: another ending.
+        OSError: the file can't be written.
     """
     path, shot = Path(path), shot or Shot()
     if path.suffix not in SUFFIXES:
@@ -97,7 +110,15 @@ def write_movie(records: Record | Sequence[Record], path: str | Path, shot: Shot
 
 
 def movie_stage(records: Record | Sequence[Record], shot: Shot | None = None) -> Any:
-    """The movie as a stage in memory. Raises as `write_movie` does."""
+    """The movie as a stage in memory.
+
+    Args:
+        records: the run, or several.
+        shot: how it is filmed; None for the defaults.
+
+    Raises:
+        RecordError: records without frames or with unequal frame intervals.
+    """
     film = _Film(records, shot or Shot())
     film.fill()
     film.finish()
@@ -120,7 +141,7 @@ def _package(stage: Any, path: Path) -> None:
 
 
 class _Film:
-    """A stage in the making: cells, their samples, and at last the camera that has seen them all."""
+    """A stage that is being filled: cells, then their samples, at last the camera, which needs the extent of all."""
 
     def __init__(self, records: Record | Sequence[Record], shot: Shot):
         from pxr import Usd
@@ -131,30 +152,36 @@ class _Film:
         self.stage = Usd.Stage.CreateInMemory()
         self._shot = shot
         self._define_world()
+        kind = MeshCell if shot.mesh else Cell
         names = ["Cell"] if len(self.records) == 1 else [f"Cell_{k}" for k in range(len(self.records))]
         cells = zip(names, self.records, scenes, strict=True)
-        self._cells = [Cell(self.stage, f"/World/{name}", *cell, shot.color_by) for name, *cell in cells]
+        self._cells = [kind(self.stage, f"/World/{name}", *cell, shot.color_by) for name, *cell in cells]
         self._view = view_axes(self.records[0].body_orientation[0])
         self._path = self._followed() if shot.follow else np.zeros((self.frame_count, 3))
         self._extents = [Extent(self._view, self._path) for _ in self._cells]
 
     @property
     def clip_frames(self) -> int:
-        """Frames per value clip; at least as many as there are means none."""
+        """Frames per value clip; there are no clips where it is not less than the number of frames."""
         return int(self._shot.clip_frames or max(1, _CLIP_BYTES // self._frame_bytes))
 
     @property
     def _frame_bytes(self) -> int:
-        return _BYTES_PER_NODE * max(1, sum(int(record.first_node[-1]) for record in self.records))
+        per_node = _BYTES_PER_MESH_NODE if self._shot.mesh else _BYTES_PER_NODE
+        return per_node * max(1, sum(int(record.first_node[-1]) for record in self.records))
 
     def fill(self) -> None:
         """Puts all samples into the stage."""
         self._fill(self.stage.GetRootLayer(), 0, self.frame_count)
 
     def write_clips(self, folder: Path, token: str) -> None:
-        """Writes the samples as value clips, TOKEN_NUMBER.usdc in a folder, and refers to them.
+        """Writes the samples as value clips, TOKEN_NUMBER.usdc, and refers to them.
 
-        Each clip also holds the first frame of the next: between the two the film still moves.
+        Each clip also holds the first frame of the next, so that values between the two are interpolated.
+
+        Args:
+            folder: where the clips go.
+            token: tells them from those of earlier movies.
         """
         from pxr import Gf, Sdf, Usd, Vt
 
@@ -207,7 +234,7 @@ class _Film:
         Usd.ModelAPI(world).SetKind("assembly")
 
     def _provenance(self) -> dict[str, Any]:
-        """What the file says of its origin and its colours; the slow-down is 0 for a single frame."""
+        """Origin and colours of the movie, for its customLayerData; the slow-down is 0 for a single frame."""
         first, coloring = self.records[0], self._cells[0].coloring
         interval = _interval(first)
         return {
@@ -227,6 +254,7 @@ class _Film:
         return np.mean(paths, axis=0)
 
     def _declared(self, layer: Any) -> Any:
+        """A layer with every attribute that changes, still without samples."""
         from pxr import Sdf
 
         for cell in self._cells:
@@ -244,7 +272,11 @@ class _Film:
 
 
 def _frame_count(records: Sequence[Record]) -> int:
-    """Of the longest record; raises RecordError where they make no film."""
+    """Number of frames of the longest record.
+
+    Raises:
+        RecordError: a record without frames, or with another interval between them.
+    """
     for record in records:
         if record.frame_count == 0:
             raise RecordError(f"{record.path}: holds no frames to make a movie of")

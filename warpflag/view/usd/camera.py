@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Extent", "add_camera", "add_lights", "arranged", "body_axes", "steady_path", "view_axes"]
+from warpflag.view.poses import body_axes
+
+__all__ = ["Extent", "add_camera", "add_lights", "arranged", "steady_path", "view_axes"]
 
 Array = NDArray[np.float64]
 
@@ -25,18 +27,14 @@ _SIDES[:4, 2] = np.repeat(_TANGENTS, 2)
 _ELEVATION = np.radians(12.0)  # the camera looks down a little, so that coils read as coils
 
 
-def body_axes(orientation: NDArray[np.floating]) -> Array:
-    """e_b1, e_b2, e_b3 in the lab as rows, of a quaternion (x, y, z, w)."""
-    x, y, z, w = orientation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return (np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross).T
-
-
 def view_axes(orientation: Array) -> Array:
-    """The camera's right, up and back axes as rows, for a body of this orientation.
+    """The camera's right, up and back axes as rows, shape [3, 3].
 
     e_b3 points to the right, so the cell swims to the left; flagella at azimuth 0 and 180 open up and down, seen
     from 12 degrees above e_b2.
+
+    Args:
+        orientation: of the body, quaternion (x, y, z, w) from body to lab axes.
     """
     e1, _, e3 = body_axes(orientation)
     e2 = np.cross(e3, e1)
@@ -45,9 +43,12 @@ def view_axes(orientation: Array) -> Array:
 
 
 def steady_path(centres: Array) -> Array:
-    """A path without the wobble, shape [frame, 3]: the moving average over a quarter of the frames.
+    """The moving average of a path over a quarter of its frames, which takes the wobble out, shape [frame, 3].
 
     Both ends are continued by their mirror image through the end point, which keeps a straight path as it is.
+
+    Args:
+        centres: points of the path [um], shape [frame, 3].
     """
     centres = np.asarray(centres, float)
     half = len(centres) // 8
@@ -62,11 +63,14 @@ def steady_path(centres: Array) -> Array:
 class Extent:
     """How far everything a cell shows reaches toward the four sides of the picture, the camera and away from it.
 
-    view: the camera's axes as rows. path: the camera's aim, frame by frame, in lab axes [um], shape [frame, 3].
+    Args:
+        view: the camera's axes as rows, shape [3, 3].
+        path: the camera's aim in lab axes [um], shape [frame, 3].
 
-    reach: for right, left, up, down: the greatest x + t z, x to that side, z toward the camera, t the tangent of half
-    the angle of view. A camera at (ex, ey, ez) has everything in view when x + t z <= ex + t ez and so on. Then the
-    greatest z and -z. All relative to the path [um], shape [6].
+    Attributes:
+        reach: relative to the path [um], shape [6]. For right, left, up, down: the greatest x + t z, x to that side, z
+            toward the camera, t the tangent of half the angle of view; a camera at (ex, ey, ez) has everything in view
+            when x + t z <= ex + t ez and so on. Then the greatest z and -z.
     """
 
     def __init__(self, view: Array, path: Array):
@@ -74,7 +78,13 @@ class Extent:
         self.reach = np.full(6, -np.inf)
 
     def add(self, frames: slice, positions: Array, margin: float) -> None:
-        """Takes balls of radius `margin` [um] at these positions [um], shape [frame, point, 3]."""
+        """Extends the reach so that it holds spheres.
+
+        Args:
+            frames: in which they are seen.
+            positions: their centres [um], shape [frame, point, 3].
+            margin: their radius [um].
+        """
         points = (positions - self._path[frames, None]).reshape(-1, 3)
         # Coordinate first: NumPy's reductions are quick along rows.
         reach = (_SIDES @ self._view @ points.T).max(axis=1) + margin * np.linalg.norm(_SIDES, axis=1)
@@ -82,9 +92,13 @@ class Extent:
 
 
 def arranged(reaches: Sequence[Array]) -> tuple[Array, Array]:
-    """How to shift cells so that they stand in rows that fill a picture, and the reach of them all.
+    """Where cells stand so that their rows fill a picture; a single cell stays where it is.
 
-    reaches: of each cell's `Extent`. Returns shifts in the camera's axes [um], shape [cell, 3]. A single cell stays.
+    Args:
+        reaches: of each cell's `Extent`.
+
+    Returns:
+        Shifts in the camera's axes [um], shape [cell, 3], and the reach of all shifted cells, shape [6].
     """
     count = len(reaches)
     if count == 1:
@@ -99,10 +113,15 @@ def arranged(reaches: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def add_camera(stage: Any, view: Array, reach: Array, path: Array | None = None) -> None:
-    """A camera at /World/Camera, as near as it has everything in view, its picture 16:9 or closer to what it shows.
+    """Adds a camera at /World/Camera, as near as it has everything in view.
 
-    view: its axes as rows. reach: of everything, see `Extent`. path: where its aim goes, frame by frame, in lab axes
-    [um], shape [frame, 3]; None for a camera that stands still.
+    Its picture is 16:9, or narrower where what it shows is.
+
+    Args:
+        stage: where it is defined.
+        view: its axes as rows, shape [3, 3].
+        reach: of everything it shows, see `Extent`.
+        path: where its aim goes in lab axes [um], shape [frame, 3]; None for a camera that stands still.
     """
     from pxr import Gf, UsdGeom
 
@@ -128,7 +147,12 @@ def add_camera(stage: Any, view: Array, reach: Array, path: Array | None = None)
 
 
 def add_lights(stage: Any, view: Array) -> None:
-    """Soft light from everywhere and a broad key light over the camera's left shoulder."""
+    """Adds soft light from everywhere and a broad key light over the camera's left shoulder.
+
+    Args:
+        stage: where they are defined.
+        view: the camera's axes as rows, shape [3, 3].
+    """
     from pxr import Gf, UsdGeom, UsdLux
 
     lights = UsdGeom.Xform.Define(stage, "/World/Lights")
@@ -141,7 +165,7 @@ def add_lights(stage: Any, view: Array) -> None:
 
 
 def _placed(axes: Array, origin: Array) -> Any:
-    """USD's matrix (row vectors) of a frame with these axes as rows, at this origin."""
+    """USD's matrix, for row vectors, of a frame with these axes as rows at this origin."""
     from pxr import Gf
 
     matrix = np.eye(4)

@@ -30,7 +30,15 @@ _LINEAR = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True)
 class Rods:
-    """Rods with round ends: axis ends [um], radius [um], linear RGB at both ends; shapes [rod, 3], [rod]."""
+    """Rods with round ends.
+
+    Attributes:
+        start: one end of each axis [um], shape [rod, 3].
+        end: the other end [um], shape [rod, 3].
+        radius: [um], shape [rod].
+        color_start: linear RGB at the start, shape [rod, 3].
+        color_end: linear RGB at the end, shape [rod, 3].
+    """
 
     start: Array
     end: Array
@@ -43,8 +51,13 @@ class Rods:
 class Camera:
     """Where a camera is and looks.
 
-    eye: [um]. right, up, back: unit vectors. tangents: of half its angles of view across and up. focus: distance of
-    the middle of the scene [um].
+    Attributes:
+        eye: its place [um], shape [3].
+        right: unit vector to the right of its picture, shape [3].
+        up: unit vector to the top of its picture, shape [3].
+        back: unit vector against the direction in which it looks, shape [3].
+        tangents: of half its angles of view across and up.
+        focus: distance of the middle of the scene [um].
     """
 
     eye: Array
@@ -56,7 +69,11 @@ class Camera:
 
 
 def opened(path: str | Path) -> Any:
-    """The stage of a USD file. Raises OutputError where it can't be read."""
+    """The stage of a USD file.
+
+    Raises:
+        OutputError: it can't be read.
+    """
     from pxr import Tf, Usd
 
     try:
@@ -68,8 +85,18 @@ def opened(path: str | Path) -> Any:
 class Film:
     """The movie of a stage or of a .usd, .usda, .usdc or .usdz file.
 
-    start, end: time codes. codes_per_second, frames_per_second: as the stage says. facts: what the program that wrote
-    it said of it. Raises OutputError for what is no movie of this program.
+    Args:
+        source: the stage, or the path of the file.
+
+    Attributes:
+        start: first time code.
+        end: last time code.
+        codes_per_second: time codes per second of the film.
+        frames_per_second: of the film.
+        facts: the movie's own customLayerData: origin, slow-down, colours.
+
+    Raises:
+        OutputError: not readable, no movie of this program, or one of meshes.
     """
 
     def __init__(self, source: Any):
@@ -91,12 +118,14 @@ class Film:
         self._stage, self._camera, self._light, self._cell = stage, cameras[0], lights[0], cells[0]
         self._curves = [UsdGeom.BasisCurves(prim) for prim in prims if prim.IsA(UsdGeom.BasisCurves)]
         self._capsules = [UsdGeom.Capsule(prim) for prim in prims if prim.IsA(UsdGeom.Capsule)]
+        if not self._curves:
+            raise OutputError(f"{name}: a movie of meshes, which is not drawn here; name the run directory")
         self.start, self.end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
         self.codes_per_second, self.frames_per_second = stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()
         self.facts: dict[str, Any] = dict(stage.GetRootLayer().customLayerData.get("warpflag", {}))
 
     def time(self, code: float) -> float:
-        """The simulated time [s]."""
+        """The simulated time at a time code [s]."""
         return self._cell.GetAttribute("warpflag:time").Get(code)
 
     def code_at(self, time: float) -> float:
@@ -108,11 +137,11 @@ class Film:
         return [self.time(code) for code in np.arange(self.start, self.end + 1)]
 
     def thinnest(self) -> float:
-        """The radius of the flagella as the movie has it, its thinnest curves [um]."""
+        """The radius of the thinnest curves, which are the flagella [um]."""
         return min(0.5 * curves.GetWidthsAttr().Get()[0] for curves in self._curves)
 
     def camera(self, code: float) -> Camera:
-        """The camera."""
+        """The camera at a time code."""
         from pxr import UsdGeom
 
         camera = UsdGeom.Camera(self._camera).GetCamera(code)
@@ -122,7 +151,7 @@ class Film:
         return Camera(eye, right, up, back, tangents, camera.focusDistance)
 
     def light(self, code: float) -> tuple[Array, float]:
-        """The unit vector toward the distant light and half the angle under which it is seen [rad]."""
+        """Unit vector toward the distant light, shape [3], and half the angle under which it is seen [rad]."""
         from pxr import UsdGeom, UsdLux
 
         toward = np.array(UsdGeom.Xformable(self._light).ComputeLocalToWorldTransform(code))[2, :3]
@@ -130,7 +159,12 @@ class Film:
         return toward / np.linalg.norm(toward), np.radians(0.5 * angle)
 
     def rods(self, code: float, least_radius: float = 0.0) -> Rods:
-        """Everything to draw; curves are drawn with `least_radius` [um] where they are thinner."""
+        """Everything to draw at a time code.
+
+        Args:
+            code: the time code.
+            least_radius: that curves have where they are thinner [um].
+        """
         from pxr import UsdGeom
 
         placed = UsdGeom.XformCache(code)
@@ -140,12 +174,13 @@ class Film:
 
 
 def _to_world(points: Array, prim: Any, placed: Any) -> Array:
+    """Points of a prim in the axes of the stage, by a cache of transforms."""
     matrix = np.array(placed.GetLocalToWorldTransform(prim))
     return points @ matrix[:3, :3] + matrix[3, :3]
 
 
 def _curve_rods(curves: Any, placed: Any, code: float, least_radius: float) -> tuple[Array, ...]:
-    """Pieces of linear or pinned Catmull-Rom curves, whose ends are continued by their mirror image."""
+    """Rods along linear or pinned Catmull-Rom curves, whose ends are continued by their mirror image."""
     points = _to_world(np.array(curves.GetPointsAttr().Get(code), float), curves.GetPrim(), placed)
     counts = np.array(curves.GetCurveVertexCountsAttr().Get(code))
     colors = _vertex_colors(curves, counts, code)
@@ -167,6 +202,7 @@ def _curve_rods(curves: Any, placed: Any, code: float, least_radius: float) -> t
 
 
 def _vertex_colors(curves: Any, counts: NDArray[np.integer], code: float) -> Array:
+    """Display colours at the vertices, whatever their interpolation, shape [vertex, 3]."""
     primvar = curves.GetDisplayColorPrimvar()
     colors = np.array(primvar.Get(code), float)
     if primvar.GetInterpolation() == "vertex":
@@ -175,6 +211,7 @@ def _vertex_colors(curves: Any, counts: NDArray[np.integer], code: float) -> Arr
 
 
 def _capsule_rod(capsule: Any, placed: Any, code: float) -> tuple[Array, ...]:
+    """A capsule as one rod."""
     axis = np.eye(3)["XYZ".index(capsule.GetAxisAttr().Get(code))] * 0.5 * capsule.GetHeightAttr().Get(code)
     start, end = _to_world(np.stack([-axis, axis]), capsule.GetPrim(), placed)
     color = np.array(capsule.GetDisplayColorAttr().Get(code), float)

@@ -6,6 +6,8 @@ CELL/Flagella       BasisCurves through every node, one curve each, coloured at 
 CELL/Motors         in the body's pose, with a Motor_K per flagellum
 CELL/Motors/Motor_K three spokes along e1, e2 and m of the motor tripod, turned about m by the motor angle
 CELL/Looks          materials: UsdPreviewSurface with the display colour
+
+`warpflag.view.usd.mesh_cell` has the same cell as meshes.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportCallIssue=false
@@ -22,23 +24,40 @@ from numpy.typing import NDArray
 from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.coloring import BODY_COLOR, Coloring, linear
-from warpflag.view.usd_shot import Extent, body_axes
+from warpflag.view.poses import body_axes, motors
+from warpflag.view.usd.camera import Extent
+from warpflag.view.usd.looks import bind_material
 
-__all__ = ["UNDEFINED", "Cell"]
+__all__ = ["SPOKE_COLORS", "SPOKE_LENGTHS", "SPOKE_WIDTH", "UNDEFINED", "Cell", "Sample"]
 
 UNDEFINED = -1.0
 """Raw value of a node at which a quantity is not defined: in a USD file a NaN is a fault."""
+SPOKE_LENGTHS = (0.28, 0.2, 0.2)
+"""Of a motor's spokes along e1, e2 and m [um]; the long one shows the turning."""
+SPOKE_WIDTH = 0.07
+"""Of a motor's spokes [um]."""
+SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
+"""Of a motor's spokes, sRGB."""
 
-_SPOKE_LENGTHS = (0.28, 0.2, 0.2)  # um, along e1, e2, m: the long one shows the turning
-_SPOKE_WIDTH = 0.07
-_SPOKE_COLORS = ("#f2b01e", "#39424e", "#5c6875")
+Sample = tuple[Any, int, Any]
+"""Path of an attribute, frame, and its value there."""
 
 
 class Cell:
-    """Authors the prims of a record's cell at `path` on a stage; `samples` yields what changes with the frame.
+    """The prims of a record's cell on a stage.
 
-    xform, prim: of the cell. coloring: of its nodes. animated: value type of each attribute that `samples` fills, by
-    its path.
+    Args:
+        stage: where they are defined.
+        path: of the cell's prim.
+        record: the run.
+        scene: of the record.
+        color_by: quantity that colours the flagella.
+
+    Attributes:
+        xform: the cell as a prim that can be placed.
+        prim: the same as a bare prim.
+        coloring: of the nodes.
+        animated: value type by path of the attributes that `samples` fills.
     """
 
     def __init__(self, stage: Any, path: str, record: Record, scene: Scene, color_by: str):
@@ -58,39 +77,51 @@ class Cell:
         time.SetDocumentation("Simulated time [s].")
         self._time = self._animate(time)
         UsdGeom.Scope.Define(stage, f"{path}/Looks")
-        body = self._add_body()
+        radius, height = 0.5 * record.body_width, record.body_length - record.body_width
+        body = self._add_body(f"{path}/Body", radius, height)
         self._poses = [self._add_pose(body), self._add_pose(UsdGeom.Xform.Define(stage, f"{path}/Motors"))]
         self._turns = self._add_motors()
-        self._points, self._extent, self._colors, self._values = self._add_flagella()
+        self._add_flagella(f"{path}/Flagella")
 
-    def samples(self, frames: slice, extent: Extent) -> Iterator[tuple[Any, int, Any]]:
-        """Attribute path, frame and value of everything that changes, for a block of frames; `extent` grows by them."""
-        from pxr import Gf, Vt
+    def samples(self, frames: slice, extent: Extent) -> Iterator[Sample]:
+        """Samples of everything that changes, for a block of frames; `extent` grows by what they show."""
+        from pxr import Gf
 
-        radius = self._record.filament_radius
         positions = self._record.positions[frames]
         turned = np.degrees(self._motor_angles[frames])
-        colors = values = None
-        if self.coloring.changes:
-            values = self.coloring.values(positions, frames)
-            colors, values = self.coloring.colors(values), np.nan_to_num(values, nan=UNDEFINED).astype(np.float32)
-        points = positions.astype(np.float32)
-        low, high = points.min(axis=1) - np.float32(radius), points.max(axis=1) + np.float32(radius)
-        extent.add(frames, positions, radius)
+        values = self.coloring.values(positions, frames) if self.coloring.changes else None
+        extent.add(frames, positions, self._radius)
         extent.add(frames, self._body_ends(frames), 0.5 * self._record.body_width)
         for i, frame in enumerate(range(frames.start, frames.stop)):
             yield self._time, frame, float(self._times[frame])
-            yield self._points, frame, Vt.Vec3fArray.FromNumpy(points[i])
-            yield self._extent, frame, Vt.Vec3fArray.FromNumpy(np.stack([low[i], high[i]]))
-            if colors is not None and values is not None:
-                yield self._colors, frame, Vt.Vec3fArray.FromNumpy(colors[i])
-                yield self._values, frame, Vt.FloatArray.FromNumpy(values[i])
             x, y, z, w = self._orientations[frame].tolist()
             for translate, orient in self._poses:
                 yield translate, frame, Gf.Vec3d(*self._positions[frame].tolist())
                 yield orient, frame, Gf.Quatd(w, x, y, z)
             for turn, angle in zip(self._turns, turned[i].tolist(), strict=True):
                 yield turn, frame, angle
+        yield from self._flagella_samples(frames, positions, values)
+
+    @property
+    def _radius(self) -> float:
+        """Of the flagella as they are shown [um]."""
+        return self._record.filament_radius
+
+    def _flagella_samples(self, frames: slice, positions: Any, values: Any) -> Iterator[Sample]:
+        """Samples of the flagella; values are those of the quantity that colours them, None where none changes."""
+        from pxr import Vt
+
+        points, colors, raw = positions.astype(np.float32), None, None
+        if values is not None:
+            colors, raw = self.coloring.colors(values), np.nan_to_num(values, nan=UNDEFINED).astype(np.float32)
+        radius = np.float32(self._radius)
+        low, high = points.min(axis=1) - radius, points.max(axis=1) + radius
+        for i, frame in enumerate(range(frames.start, frames.stop)):
+            yield self._points, frame, Vt.Vec3fArray.FromNumpy(points[i])
+            yield self._extent, frame, Vt.Vec3fArray.FromNumpy(np.stack([low[i], high[i]]))
+            if colors is not None and raw is not None:
+                yield self._colors, frame, Vt.Vec3fArray.FromNumpy(colors[i])
+                yield self._raw, frame, Vt.FloatArray.FromNumpy(raw[i])
 
     def _body_ends(self, frames: slice) -> NDArray[np.float64]:
         """Middles of the body's round ends [um], shape [frame, 2, 3]."""
@@ -99,6 +130,7 @@ class Cell:
         return self._positions[frames][:, None] + half * axes[:, None] * np.array([[-1.0], [1.0]])
 
     def _animate(self, attribute: Any) -> Any:
+        """Notes an attribute as one that changes; returns its path."""
         self.animated[attribute.GetPath()] = attribute.GetTypeName()
         return attribute.GetPath()
 
@@ -109,110 +141,76 @@ class Cell:
         orient = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
         return self._animate(translate.GetAttr()), self._animate(orient.GetAttr())
 
-    def _add_body(self) -> Any:
+    def _add_body(self, path: str, radius: float, height: float) -> Any:
         from pxr import Gf, UsdGeom
 
-        record = self._record
-        radius, height = 0.5 * record.body_width, record.body_length - record.body_width
-        body = UsdGeom.Capsule.Define(self._stage, f"{self._path}/Body")
+        body = UsdGeom.Capsule.Define(self._stage, path)
         body.CreateAxisAttr(UsdGeom.Tokens.z)
         body.CreateRadiusAttr(radius)
         body.CreateHeightAttr(height)
         corner = Gf.Vec3f(radius, radius, 0.5 * height + radius)
         body.CreateExtentAttr([-corner, corner])
         body.CreateDisplayColorAttr([Gf.Vec3f(*linear(BODY_COLOR).tolist())])
-        self._bind_material(body.GetPrim(), "BodyMaterial", roughness=0.6)
+        self._bind(body.GetPrim(), "BodyMaterial", roughness=0.6)
         return body
 
-    def _add_flagella(self) -> tuple[Any, Any, Any, Any]:
+    def _add_flagella(self, path: str) -> None:
         from pxr import Sdf, UsdGeom, Vt
 
-        record, coloring = self._record, self.coloring
-        curves = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Flagella")
+        coloring = self.coloring
+        curves = UsdGeom.BasisCurves.Define(self._stage, path)
         curves.CreateTypeAttr(UsdGeom.Tokens.cubic)
         curves.CreateBasisAttr(UsdGeom.Tokens.catmullRom)
         curves.CreateWrapAttr(UsdGeom.Tokens.pinned)
-        curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(np.diff(record.first_node).astype(np.int32)))
-        curves.CreateWidthsAttr([2.0 * record.filament_radius])
+        curves.CreateCurveVertexCountsAttr(Vt.IntArray.FromNumpy(np.diff(self._record.first_node).astype(np.int32)))
+        curves.CreateWidthsAttr([2.0 * self._radius])
         curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
         colors = curves.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).GetAttr()
         raw = UsdGeom.PrimvarsAPI(curves).CreatePrimvar(
             coloring.primvar, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex
         )
-        if not coloring.changes:
+        self._bind(curves.GetPrim(), "FlagellaMaterial", roughness=0.4)
+        self._points, self._extent = (self._animate(a) for a in (curves.CreatePointsAttr(), curves.CreateExtentAttr()))
+        if coloring.changes:
+            self._colors, self._raw = self._animate(colors), self._animate(raw.GetAttr())
+        else:
             values = coloring.values(np.empty((0, 0, 0)), slice(0, 0))[0]
             colors.Set(Vt.Vec3fArray.FromNumpy(coloring.colors(values)))
             raw.Set(Vt.FloatArray.FromNumpy(values.astype(np.float32)))
-        self._bind_material(curves.GetPrim(), "FlagellaMaterial", roughness=0.4)
-        changing = [curves.CreatePointsAttr(), curves.CreateExtentAttr()]
-        paths = [self._animate(attribute) for attribute in changing]
-        if coloring.changes:
-            return paths[0], paths[1], self._animate(colors), self._animate(raw.GetAttr())
-        return paths[0], paths[1], None, None
 
     def _add_motors(self) -> list[Any]:
-        """A motor per flagellum, its tripod at angle 0 set into the body; returns where the angles go."""
+        """Adds a motor per flagellum, its tripod at angle 0 set into the body; returns where the angles go."""
         from pxr import Gf, UsdGeom
 
-        record = self._record
-        first = record.first_node[:-1]
-        to_body = body_axes(self._orientations[0])  # rows: the body's axes in the lab
-        anchors = (record.positions[0][first] - self._positions[0]) @ to_body.T
-        e1, axes = record.directors[0][first] @ to_body.T, _motor_axes(self._scene)
         turns = []
-        for k, (anchor, director, axis) in enumerate(zip(anchors, e1, axes, strict=True)):
-            back = self._motor_angles[0, k]  # the angle at the first frame need not be 0
-            director = np.cos(back) * director - np.sin(back) * np.cross(axis, director)
-            tripod = Gf.Matrix3d(*np.stack([director, np.cross(axis, director), axis]).ravel().tolist())
-            motor = UsdGeom.BasisCurves.Define(self._stage, f"{self._path}/Motors/Motor_{k}")
+        for k, (anchor, axes) in enumerate(zip(*motors(self._record, self._scene), strict=True)):
+            tripod = Gf.Matrix3d(*axes.ravel().tolist())
+            motor = self._add_spokes(f"{self._path}/Motors/Motor_{k}")
             motor.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*anchor.tolist()))
             motor.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(
                 tripod.GetOrthonormalized().ExtractRotation().GetQuat()
             )
             turns.append(self._animate(motor.AddRotateZOp(UsdGeom.XformOp.PrecisionDouble).GetAttr()))
-            self._add_spokes(motor)
         return turns
 
-    def _add_spokes(self, motor: Any) -> None:
+    def _add_spokes(self, path: str) -> Any:
         from pxr import UsdGeom, Vt
 
+        motor = UsdGeom.BasisCurves.Define(self._stage, path)
         points = np.zeros((6, 3), dtype=np.float32)
-        points[1::2] = np.diag(_SPOKE_LENGTHS)
+        points[1::2] = np.diag(SPOKE_LENGTHS)
         motor.CreateTypeAttr(UsdGeom.Tokens.linear)
         motor.CreateCurveVertexCountsAttr([2, 2, 2])
         motor.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-        motor.CreateWidthsAttr([_SPOKE_WIDTH])
+        motor.CreateWidthsAttr([SPOKE_WIDTH])
         motor.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-        half = 0.5 * _SPOKE_WIDTH
-        extent = np.array([[-half] * 3, np.add(_SPOKE_LENGTHS, half)], dtype=np.float32)
+        half = 0.5 * SPOKE_WIDTH
+        extent = np.array([[-half] * 3, np.add(SPOKE_LENGTHS, half)], dtype=np.float32)
         motor.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
-        colors = np.stack([linear(color) for color in _SPOKE_COLORS])
+        colors = np.stack([linear(color) for color in SPOKE_COLORS])
         motor.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(colors))
-        self._bind_material(motor.GetPrim(), "FlagellaMaterial", roughness=0.4)
+        self._bind(motor.GetPrim(), "FlagellaMaterial", roughness=0.4)
+        return motor
 
-    def _bind_material(self, prim: Any, name: str, roughness: float) -> None:
-        """A plain surface that shows the prim's displayColor, whatever its interpolation."""
-        from pxr import Sdf, UsdShade
-
-        stage, path = self._stage, f"{self._path}/Looks/{name}"
-        material = UsdShade.Material.Get(stage, path)
-        if not material:
-            material = UsdShade.Material.Define(stage, path)
-            reader = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Color"))
-            reader.CreateIdAttr("UsdPrimvarReader_float3")
-            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-            color = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
-            surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("Surface"))
-            surface.CreateIdAttr("UsdPreviewSurface")
-            surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(color)
-            surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
-            output = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-            material.CreateSurfaceOutput().ConnectToSource(output)
-        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
-
-
-def _motor_axes(scene: Scene) -> NDArray[np.float64]:
-    """The motor axes m in body axes, shape [flagellum_count, 3]."""
-    specs = scene.resolved_flagella()
-    angle, around = (np.radians([getattr(spec, name) for spec in specs]) for name in ("motor_axis_angle", "azimuth"))
-    return np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1)
+    def _bind(self, prim: Any, name: str, roughness: float, color: str | None = None) -> None:
+        bind_material(prim, f"{self._path}/Looks/{name}", roughness, color)

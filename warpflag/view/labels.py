@@ -1,0 +1,75 @@
+"""Labels of runs by what differs between their scenes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from warpflag.scene import Scene, dumps
+
+__all__ = ["Labels", "labels_of"]
+
+_LEAST = ("name", "duration", "frames")  # they label runs only where nothing else differs
+_LONGEST = 48  # letters of a label
+
+
+class Labels(NamedTuple):
+    """How runs are told apart.
+
+    Attributes:
+        title: the setting that differs, where it is a single one; otherwise empty.
+        labels: one per run.
+        values: the values of that setting where they are numbers, otherwise None.
+    """
+
+    title: str
+    labels: list[str]
+    values: list[float] | None
+
+
+def labels_of(scenes: Sequence[Scene]) -> Labels:
+    """Labels of runs by the settings in which their scenes differ; runs of equal scenes are numbered."""
+    settings = [_flattened(tomllib.loads(dumps(scene))) for scene in scenes]
+    keys = list(dict.fromkeys(key for each in settings for key in each))
+    differing = [key for key in keys if len({str(each.get(key)) for each in settings}) > 1]
+    telling = [key for key in differing if key not in _LEAST] or [key for key in differing if key != "name"]
+    if len(telling) == 1:
+        (key,) = telling
+        values = [each.get(key) for each in settings]
+        numbers = [float(value) for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
+        title = " ".join(filter(None, [key, _unit(scenes[0], key)]))
+        return Labels(title, [_text(value) for value in values], numbers if len(numbers) == len(values) else None)
+    labels = [", ".join(f"{key.rpartition('.')[2]} {_text(each.get(key))}" for key in telling) for each in settings]
+    if not telling or max(map(len, labels)) > _LONGEST:
+        labels = [scene.name for scene in scenes]
+    numbered = enumerate(labels, 1)
+    return Labels("", [f"{label} ({k})" if labels.count(label) > 1 else label for k, label in numbered], None)
+
+
+def _unit(scene: Scene, key: str) -> str:
+    """The unit of a setting in brackets; empty where it has none."""
+    section, _, name = key.rpartition(".")
+    owner = scene.flagellum[0] if section.startswith("flagellum.") else getattr(scene, section) if section else scene
+    unit = owner.settings[name].unit.replace("um", "µm")
+    return f"({unit})" if unit else ""
+
+
+def _flattened(table: Any, key: str = "") -> dict[str, Any]:
+    """Values of nested tables and lists of tables by dotted key."""
+    if isinstance(table, dict):
+        items = table.items()
+    elif isinstance(table, list) and table and isinstance(table[0], dict):
+        items = ((str(number), each) for number, each in enumerate(table))
+    else:
+        return {key: table}
+    flat: dict[str, Any] = {}
+    for name, value in items:
+        flat |= _flattened(value, f"{key}.{name}" if key else name)
+    return flat
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "default"
+    return f"{value:g}" if isinstance(value, float) else str(value)
