@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from warpflag.record import Record
     from warpflag.record.recorder import Recorder
     from warpflag.run.simulation import NumericalError, Simulation
-    from warpflag.scene.scene import (
+    from warpflag.scene import Scene, SceneError, load, with_values
+    from warpflag.scene.sections import (
         Body,
         External,
         Flagella,
@@ -18,12 +19,8 @@ if TYPE_CHECKING:
         Hydrodynamics,
         Motor,
         Numerics,
-        Scene,
-        SceneError,
         Start,
         Steric,
-        load,
-        with_values,
     )
 
 __version__ = "0.1.0"
@@ -51,24 +48,24 @@ __all__ = [
 
 # Where each name lives; loaded on first use, so that `import warpflag` and the command line's --help stay quick.
 _HOMES = {
-    "Body": "scene.scene",
-    "External": "scene.scene",
-    "Flagella": "scene.scene",
-    "FlagellumOverride": "scene.scene",
-    "Fluid": "scene.scene",
-    "Hydrodynamics": "scene.scene",
-    "Motor": "scene.scene",
+    "Body": "scene.sections",
+    "External": "scene.sections",
+    "Flagella": "scene.sections",
+    "FlagellumOverride": "scene.sections",
+    "Fluid": "scene.sections",
+    "Hydrodynamics": "scene.sections",
+    "Motor": "scene.sections",
     "NumericalError": "run.simulation",
-    "Numerics": "scene.scene",
+    "Numerics": "scene.sections",
     "Record": "record",
     "Recorder": "record.recorder",
-    "Scene": "scene.scene",
-    "SceneError": "scene.scene",
+    "Scene": "scene",
+    "SceneError": "scene",
     "Simulation": "run.simulation",
-    "Start": "scene.scene",
-    "Steric": "scene.scene",
-    "load": "scene.scene",
-    "with_values": "scene.scene",
+    "Start": "scene.sections",
+    "Steric": "scene.sections",
+    "load": "scene",
+    "with_values": "scene",
 }
 
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from warpflag import __version__
+from warpflag.base.streams import protected_streams
 
 if TYPE_CHECKING:
     from warpflag.scene import Scene
@@ -29,6 +30,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
+@protected_streams()
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit status."""
     options = _parser().parse_args(arguments)
@@ -43,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(message: object, status: int) -> int:
-    print(f"warpflag: {message}", file=sys.stderr)
+    print("\n".join(f"warpflag: {line}" for line in str(message).splitlines()), file=sys.stderr)
     return status
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ import pytest
 from tests.shapes import Zipping
 from warpflag.model import zipper
 from warpflag.model.zipper import PAPER, Zipper
-from warpflag.record import Record
+from warpflag.record import RECORD_NAME, Record
+from warpflag.record.recorder import Recorder
 
 PLAIN = Zipper(
     opening_angle=60.0, axial_length=5.0, phase_velocity=300.0, body_speed=150.0, body_rate=80.0, radius=0.2, start=1.0
@@ -122,8 +125,13 @@ def test_zipping_is_found_in_a_record_and_fitted(made):
     assert found.residual < 0.03
 
 
-def test_a_record_that_never_zips_is_refused(made):
-    with Record(made.directory) as record:
-        record.frame_count = 30  # cut before the front reaches the tips
-        with pytest.raises(ValueError, match="never complete"):
-            zipper.zipping(record)
+def test_a_record_that_never_zips_is_refused(made, tmp_path):
+    path = Path(shutil.copy(made.directory / RECORD_NAME, tmp_path))
+    with Record(path) as record:
+        last, given = int(record.steps[29]), record.parameters  # before the front reaches the tips
+    sizes = {name: given[name] for name in ("filament_radius", "body_length", "body_width")}
+    cut = Recorder(path, resume_step=last)
+    cut.start(given["scene"], given["first_node"], **sizes)
+    cut.close()
+    with Record(path) as record, pytest.raises(ValueError, match="never complete"):
+        zipper.zipping(record)

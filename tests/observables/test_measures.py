@@ -152,6 +152,14 @@ def test_steric_force_law():
     np.testing.assert_allclose(found, [0.8, force_at(0.038), 0.0, 155.4 + 7.424e4 * 0.008], rtol=1e-3, atol=1e-12)
 
 
+@pytest.mark.parametrize(("angle", "s", "t"), [(0.5, 0.3, 0.6), (3e-5, 0.3, 0.6), (3e-6, 0.5, 0.8)])
+def test_closest_points_of_nearly_parallel_segments(angle, s, t):
+    """Segments 0.04 apart whose common normal is at s = 0.3, t = 0.6; below 1e-5 rad they count as parallel."""
+    along, across = np.array([0.0, 0.0, 0.2]), 0.2 * np.array([math.sin(angle), 0.0, math.cos(angle)])
+    found = observables.closest_parameters(-0.3 * along, along, np.array([0.0, 0.04, 0.0]) - 0.6 * across, across)
+    np.testing.assert_allclose(found, [s, t], atol=1e-5)
+
+
 @pytest.mark.parametrize(("where", "count"), [("between nodes", 1), ("at a node", 2), ("at two nodes", 4)])
 def test_crossed_lines_by_every_rule(where, count):
     """A contact at a vertex counts twice, where two vertices meet four times; one at mid-segment once."""

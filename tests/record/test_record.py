@@ -4,74 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
 import pytest
 
-from warpflag.record import Frame, Record, RecordError
-from warpflag.record import recorder as recorder_module
-from warpflag.record.recorder import Recorder
-
-FIRST_NODE = np.array([0, 4, 9])  # two flagella, of 3 and 4 segments
-SCENE = 'name = "two"  # \u03a6 = 90\n'
-ENTRIES = [
-    "particles/flagella/position",
-    "particles/flagella/e1",
-    "cell/motor_angle",
-    "cell/body_position",
-    "cell/body_orientation",
-    "observables/bundle_length",
-    "observables/motor_rate",
-]
-
-
-def frame(index: int) -> Frame:
-    """A frame whose every number tells the frame it belongs to."""
-    nodes = np.arange(27.0).reshape(9, 3)
-    return Frame(
-        time=index * 1e-4,
-        step=10 * index,
-        positions=index + nodes / 100,
-        directors=-index - nodes / 100,
-        motor_angle=np.array([index, -index], float),
-        body_position=np.array([index, 0.0, -index]) / 7,
-        body_orientation=np.array([0.0, 0.0, np.sin(index), np.cos(index)]),
-        observables={"bundle_length": index / 3, "motor_rate": np.array([index, 2.0 * index])},
-    )
-
-
-def started(path: Path, **options) -> Recorder:
-    recorder = Recorder(path, **options)
-    recorder.start(
-        SCENE, FIRST_NODE, filament_radius=0.01, body_length=2.5, body_width=0.8, versions={"warpflag": "1.2.3"}
-    )
-    return recorder
-
-
-def written(path: Path, count: int) -> Path:
-    recorder = started(path)
-    for index in range(count):
-        recorder.write(frame(index))
-    recorder.close()
-    return path
-
-
-def assert_holds_frames(record: Record, indices) -> None:
-    """Every dataset of the record holds exactly these frames, to the last bit."""
-    expected = [frame(index) for index in indices]
-    assert record.frame_count == len(expected)
-    np.testing.assert_array_equal(record.times, [f.time for f in expected])
-    np.testing.assert_array_equal(record.steps, [f.step for f in expected])
-    for name in ("positions", "directors", "motor_angle", "body_position", "body_orientation"):
-        np.testing.assert_array_equal(np.asarray(getattr(record, name)), [getattr(f, name) for f in expected])
-    assert set(record.observables) == {"bundle_length", "motor_rate"}
-    for name, values in record.observables.items():
-        np.testing.assert_array_equal(values, [f.observables[name] for f in expected])
+from tests.record.frames import ENTRIES, FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
+from warpflag.record import Record, RecordError
 
 
 def test_what_is_written_is_what_is_read(tmp_path):
@@ -97,11 +36,11 @@ def test_file_is_h5md(tmp_path):
     with h5py.File(written(tmp_path / "run.h5", 12)) as file:
         np.testing.assert_array_equal(file["h5md"].attrs["version"], [1, 1])
         assert "name" in file["h5md/author"].attrs
-        assert file["h5md/creator"].attrs["name"] == "warpflag"
-        assert file["h5md/creator"].attrs["version"] == "1.2.3"
+        assert file["h5md/creator"].attrs["name"] == b"warpflag"
+        assert file["h5md/creator"].attrs["version"] == b"1.2.3"
         assert list(file["particles"]) == ["flagella"]
         box = file["particles/flagella/box"].attrs
-        assert box["dimension"] == 3 and list(box["boundary"]) == ["none"] * 3
+        assert box["dimension"] == 3 and list(box["boundary"]) == [b"none"] * 3
         for entry in ENTRIES:
             assert set(file[entry]) == {"value", "step", "time"}, entry
             assert len(file[entry]["value"]) == 12
@@ -161,10 +100,9 @@ def test_reader_sees_committed_frames_of_a_run_that_goes_on(tmp_path):
     recorder.close()
 
 
-def test_slow_frames_are_committed_by_the_clock(tmp_path, monkeypatch):
+def test_slow_frames_are_committed_by_the_clock(tmp_path):
     now = [100.0]
-    monkeypatch.setattr(recorder_module.time, "monotonic", lambda: now[0])
-    recorder = started(tmp_path / "run.h5")
+    recorder = started(tmp_path / "run.h5", clock=lambda: now[0])
     recorder.write(frame(0))
     now[0] += 1.0
     recorder.write(frame(1))
@@ -189,119 +127,6 @@ def test_everything_is_cut_to_the_commit_marker(tmp_path):
     recorder.close()
     with Record(path) as record:
         assert_holds_frames(record, range(13))
-
-
-WRITER = """
-import sys
-sys.path[:0] = {paths!r}
-from pathlib import Path
-from test_record import frame, started
-recorder = started(Path({path!r}))
-index = 0
-while True:
-    recorder.write(frame(index))
-    index += 1
-    if index % 10 == 1:
-        recorder.flush()
-        print(recorder.frame_count, flush=True)
-        if {wait!r}:
-            sys.stdin.readline()
-"""
-
-
-def start_writer(path: Path, *, wait: bool) -> subprocess.Popen:
-    """A process that writes frames without end and says after every flush how many it has committed."""
-    here = Path(__file__).parent
-    script = WRITER.format(paths=[str(here.parents[1]), str(here)], path=str(path), wait=wait)
-    return subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-
-def test_another_process_reads_while_a_run_writes(tmp_path):
-    with start_writer(tmp_path / "run.h5", wait=True) as process:
-        assert process.stdin is not None and process.stdout is not None
-        for committed in (1, 11, 21):
-            assert int(process.stdout.readline()) == committed
-            with Record(tmp_path) as record:
-                assert_holds_frames(record, range(committed))
-            process.stdin.write("on\n")
-            process.stdin.flush()
-        process.kill()
-
-
-@pytest.mark.parametrize("blocks", [1, 2, 7, 40, 90])
-def test_a_killed_writer_leaves_every_committed_frame(tmp_path, blocks):
-    path = tmp_path / "run.h5"
-    process = start_writer(path, wait=False)
-    try:
-        assert process.stdout is not None
-        for _ in range(blocks):
-            promised = int(process.stdout.readline())
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        said_after = process.communicate()[0].splitlines()
-    promised = int(said_after[-1]) if said_after else promised
-    with Record(path) as record:
-        assert record.frame_count >= promised >= 10 * blocks - 9
-        assert_holds_frames(record, range(record.frame_count))
-    assert process.returncode == -signal.SIGKILL
-
-
-def test_an_interrupted_commit_is_repeated(tmp_path, monkeypatch):
-    recorder = started(tmp_path / "run.h5")
-    for index in range(10):
-        recorder.write(frame(index))
-    flush, calls = h5py.File.flush, []
-
-    def interrupted(file):
-        flush(file)
-        calls.append(file)
-        raise KeyboardInterrupt
-
-    for at in (10, 11):  # between the values and the marker, twice
-        monkeypatch.setattr(h5py.File, "flush", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            recorder.write(frame(at))
-            recorder.flush()
-        monkeypatch.setattr(h5py.File, "flush", flush)
-        assert Record(tmp_path).frame_count == 1
-    assert len(calls) == 2
-    recorder.close()
-    with Record(tmp_path) as record:
-        assert_holds_frames(record, range(12))
-
-
-def test_resume_cuts_at_the_step_and_appends(tmp_path):
-    path = written(tmp_path / "run.h5", 25)
-    recorder = Recorder(path, resume_step=105)  # between the steps of frames 10 and 11
-    recorder.start("longer", FIRST_NODE, filament_radius=0.01, body_length=2.5, body_width=0.8)
-    assert recorder.frame_count == 11
-    with Record(path) as record:
-        assert_holds_frames(record, range(11))
-    for index in range(11, 30):
-        recorder.write(frame(index))
-    recorder.close()
-    with Record(path) as record:
-        assert_holds_frames(record, range(30))
-        assert record.scene_text == "longer"
-        assert record.scene_sha256 == hashlib.sha256(b"longer").hexdigest()
-
-
-def test_resume_keeps_the_frame_of_its_step(tmp_path):
-    path = written(tmp_path / "run.h5", 25)
-    started(path, resume_step=100).close()
-    with Record(path) as record:
-        assert_holds_frames(record, range(11))
-
-
-def test_resume_needs_a_record_of_the_same_flagella(tmp_path):
-    with pytest.raises(RecordError, match="no such record"):
-        started(tmp_path / "run.h5", resume_step=0)
-    path = written(tmp_path / "run.h5", 3)
-    other = Recorder(path, resume_step=0)
-    with pytest.raises(RecordError, match="other flagella"):
-        other.start(SCENE, np.array([0, 5, 9]), filament_radius=0.01, body_length=2.5, body_width=0.8)
-    with Record(path) as record:
-        assert_holds_frames(record, range(3))
 
 
 def test_a_record_is_never_overwritten(tmp_path):

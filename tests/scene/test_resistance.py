@@ -14,6 +14,7 @@ import pytest
 from tests.helpers import attachment, cell, ground_state_frames, helix_axis, placed
 from tests.oracles import device_mobility
 from warpflag.run.simulation import Simulation
+from warpflag.scene.resistance import spheroid_mobility
 
 # Relative to resistive-force theory and to the numbers quoted below, which have three or four digits.
 TOLERANCE = {"float64": 5e-3, "float32": 5e-3}
@@ -68,6 +69,28 @@ def resistive_force_theory(length: float) -> np.ndarray:
         (perpendicular - parallel) * RADIUS * along * around,
         RADIUS**2 * (parallel * around**2 + perpendicular * along**2),
     ])  # fmt: skip
+
+
+def perrin(a: float, b: float) -> list[float]:
+    """Drag of a prolate spheroid along, across, about and across its axis in a fluid of viscosity 1, by quadrature.
+
+    Semi-axes a, b, b; Perrin's integrals chi, alpha_i over s = b^2 (x/(1 - x))^2.
+    """
+    x, weights = np.polynomial.legendre.leggauss(400)
+    x, weights = (x + 1) / 2, weights / 2
+    s, ds = b**2 * (x / (1 - x)) ** 2, weights * 2 * b**2 * x / (1 - x) ** 3
+    root = np.sqrt(a**2 + s) * (b**2 + s)
+    chi, alpha, beta = np.sum(ds / root), np.sum(ds / (a**2 + s) / root), np.sum(ds / (b**2 + s) / root)
+    rolling = 16 * math.pi / (3 * beta)
+    tumbling = 16 * math.pi * (a**2 + b**2) / (3 * (a**2 * alpha + b**2 * beta))
+    return [16 * math.pi / (chi + alpha * a**2), 16 * math.pi / (chi + beta * b**2), rolling, tumbling]
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1 + 1e-9, 1.00004, 1.00006, 1.02, 1.1, 1.5, 3.125, 20.0])
+def test_mobility_of_the_body_is_perrins(aspect):
+    found = spheroid_mobility(2.0 * aspect, 2.0, 0.01)
+    expected = [1 / (0.01 * drag) for drag in perrin(aspect, 1.0)]
+    assert [found.along, found.across, found.spin, found.tumble] == pytest.approx(expected, rel=1e-7)
 
 
 def test_local_drag_is_resistive_force_theory(precision, device):

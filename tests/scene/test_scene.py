@@ -11,15 +11,12 @@ from typing import Any
 
 import pytest
 
-from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, with_values
-from warpflag.scene import scene as scene_module
+from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, sections, with_values
 from warpflag.scene.settings import Section
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
-SECTIONS = [
-    cls
-    for cls in vars(scene_module).values()
-    if isinstance(cls, type) and issubclass(cls, Section) and cls is not Section
+SECTIONS = [Scene] + [
+    cls for cls in vars(sections).values() if isinstance(cls, type) and issubclass(cls, Section) and cls is not Section
 ]
 SETTINGS = [(cls, name) for cls in SECTIONS for name in cls.settings]
 NUMERIC = [(cls, name) for cls, name in SETTINGS if cls.settings[name].kind in ("number", "integer")]
@@ -177,11 +174,6 @@ def test_bounds_are_inclusive_and_hold(cls, name):
     for wrong in (math.nan, math.inf, True, "3", [3.0], b"3"):
         with pytest.raises(SceneError):
             make(cls, name, wrong)
-    if setting.smallest:
-        make(cls, name, 0.0)
-        make(cls, name, -setting.smallest)
-        with pytest.raises(SceneError):
-            make(cls, name, 0.99 * setting.smallest)
 
 
 @pytest.mark.parametrize(
@@ -207,9 +199,9 @@ def test_extremes_that_a_stability_study_needs_are_allowed(key, value):
 
 @pytest.mark.parametrize(("cls", "name"), SETTINGS)
 def test_docstrings_tell_every_setting(cls, name):
-    assert f"- {name} = " in cls.__doc__
-    assert cls.settings[name].meaning in cls.__doc__
-    assert cls.settings[name].bounds in cls.__doc__
+    line = next(line for line in cls.__doc__.splitlines() if line.startswith(f"        {name}: "))
+    assert cls.settings[name].meaning in line and cls.settings[name].bounds in line
+    assert line.endswith(".") and ("; default " in line or "; required" in line)
 
 
 def test_defaults_are_the_papers(tmp_path):
@@ -316,12 +308,12 @@ def test_with_values_checks_and_leaves_the_original(tmp_path):
 def test_a_written_scene_reads_back_equal(tmp_path):
     scene = Scene(
         "all the settings",
-        flagella=scene_module.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
-        flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(0.1)),
-        fluid=scene_module.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
-        hydrodynamics=scene_module.Hydrodynamics("within", 0.02),
-        numerics=scene_module.Numerics("euler", 1e-9 / 7, "float32", 1e-3),
-        start=scene_module.Start('a "quoted" \\ path\t\x7f é', 3),
+        flagella=sections.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
+        flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(60.1)),
+        fluid=sections.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
+        hydrodynamics=sections.Hydrodynamics("within", 0.02),
+        numerics=sections.Numerics("euler", 1e-9 / 7, "float32", 1e-3),
+        start=sections.Start('a "quoted" \\ path\t\x7f é', 3),
     )
     assert scene_from(tmp_path, dumps(scene)) == scene
 

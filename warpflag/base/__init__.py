@@ -1,1 +1,1 @@
-"""Devices, output files and progress: what the other rooms stand on."""
+"""Devices, output files, text streams, the progress line and rotations, which all other rooms use."""

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import os
-import sys
 import tempfile
 from typing import Any
+
+from warpflag.base.streams import say
 
 __all__ = ["DeviceError", "find_device", "list_devices", "start_warp"]
 
 
 class DeviceError(ValueError):
-    """There is no such device here; one line that says which there are."""
+    """This machine has no such device; the message is one line that says which it has."""
 
 
 @functools.cache
@@ -25,10 +26,14 @@ def start_warp() -> Any:
     import warp as wp
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    sys.stderr.flush()
-    kept = os.dup(2)
+    try:
+        kept = os.dup(2)
+    except OSError:  # no standard error
+        wp.init()
+        return wp
     try:
         with tempfile.TemporaryFile() as caught:
+            say("")  # what Python holds back goes first
             os.dup2(caught.fileno(), 2)
             try:
                 wp.init()
@@ -38,14 +43,18 @@ def start_warp() -> Any:
             lines = caught.read().decode(errors="replace").splitlines(keepends=True)
     finally:
         os.close(kept)
-    sys.stderr.write("".join(line for line in lines if "find or load the NVIDIA CUDA driver" not in line))
+    say("".join(line for line in lines if "find or load the NVIDIA CUDA driver" not in line))
     return wp
 
 
 def find_device(name: Any = None) -> Any:
-    """Warp's device of that name ("cpu", "cuda:0"), its preferred one for None.
+    """Warp's device of a name.
 
-    Raises DeviceError where there is none.
+    Args:
+        name: "cpu", "cuda:0", ...; default: the device that Warp prefers.
+
+    Raises:
+        DeviceError: this machine has no such device.
     """
     wp = start_warp()
     try:

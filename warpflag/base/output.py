@@ -1,25 +1,55 @@
-"""Files made from a record: whole or absent, and one kind of error for what can't be made."""
+"""Output files: written whole or not at all, and the errors of those that can't be written."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["OutputError", "whole"]
+__all__ = ["DiskError", "OutputError", "whole"]
 
 
 class OutputError(ValueError):
-    """A movie, picture or export that can't be made as it was asked for; one line."""
+    """A movie, picture or export that can't be made as it was asked for; the message is one line."""
 
 
-@contextmanager
+class DiskError(OSError):
+    """A file that the machine could not write; the message is one line with its path and the reason."""
+
+    @classmethod
+    def of(cls, path: str | Path, error: BaseException) -> DiskError:
+        """The error for a file at `path` that could not be written because of `error`."""
+        if isinstance(error, OSError) and error.errno:
+            reason = os.strerror(error.errno)
+        else:
+            reason = " ".join(str(error).split())
+        return cls(f"{path}: can't be written: {reason}")
+
+
+@contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A temporary name of the same kind beside `path`; what was written there is `path` when the block ends well."""
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    """Yields a temporary path beside `path`, which takes the place of `path` when the block ends without an error.
+
+    Args:
+        path: the file to write; its suffix is also that of the temporary path.
+
+    Raises:
+        OutputError: the folder of `path` does not exist.
+        DiskError: the operating system could not write the file.
+    """
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: can't be written: there is no folder {path.parent}")
+    temporary = path.with_name(f".{path.stem[:100]}.tmp{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if isinstance(error, DiskError):
+            raise
+        if error.filename is not None and Path(os.fsdecode(error.filename)) != temporary:
+            raise  # of another file, which the message names
+        raise DiskError.of(path, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()

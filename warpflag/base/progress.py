@@ -1,4 +1,4 @@
-"""A progress line: simulated time, milliseconds of computing per simulated millisecond, time left."""
+"""The progress line of a run: simulated time, computing time per simulated millisecond, time left."""
 
 from __future__ import annotations
 
@@ -7,23 +7,31 @@ from collections.abc import Callable
 from time import monotonic
 from typing import TextIO
 
+from warpflag.base.streams import is_terminal, say
+
 __all__ = ["Progress"]
 
 _BAR_CELLS = 16
 _TERMINAL_INTERVAL = 0.1
-_LOG_INTERVAL = 1.0
-_TELLING_SECONDS = 2.0
-_TELLING_SHARE = 0.01
+_LOG_INTERVAL = 60.0
+_LOG_SHARE = 0.01
+# The speed is shown once this much has been run, in seconds or as a share of the whole: the first moments cost more.
+_SECONDS_BEFORE_SPEED = 2.0
+_SHARE_BEFORE_SPEED = 0.01
 
 
 class Progress:
-    """Shows how far a run is: a bar that is redrawn on a terminal, one line a second at most anywhere else.
+    """Shows how far a run is: a bar that is redrawn on a terminal; anywhere else a line a minute, a percent apart.
 
     The first update sets the point from which speed is measured: call it before the first step (after
-    compiling, and at the time from which a run is resumed), then as often as is handy.
+    compiling, and at the time from which a run is resumed), then as often as is handy. A stream that can't be
+    written to, because it is closed, full, or its reader has left, makes it silent; the run goes on.
 
-    total: time to reach [s, simulated]. stream: where to write. quiet: write nothing. clock: seconds that
-    pass, for tests.
+    Args:
+        total: simulated time to reach [s].
+        stream: where to write; default: standard error.
+        quiet: write nothing.
+        clock: seconds that pass, for tests.
     """
 
     def __init__(
@@ -37,7 +45,7 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._quiet = quiet
         self._clock = clock
-        self._terminal = self._stream.isatty()
+        self._terminal = is_terminal(self._stream)
         self._start: tuple[float, float] | None = None
         self._shown_at = 0.0
         self._time: float | None = None
@@ -56,7 +64,9 @@ class Progress:
             if self._terminal:
                 self._show(now)
         elif now - self._shown_at >= (_TERMINAL_INTERVAL if self._terminal else _LOG_INTERVAL):
-            self._show(now)
+            before = self._start[1] if self._shown is None else self._shown
+            if self._terminal or time - before >= _LOG_SHARE * self._total:
+                self._show(now)
 
     def close(self) -> None:
         """Shows the last time reported and ends the line."""
@@ -86,22 +96,22 @@ class Progress:
             filled = int(_BAR_CELLS * fraction)
             line = f"[{'#' * filled}{'.' * (_BAR_CELLS - filled)}] {line}"
         simulated = self._time - self._start[1]
-        # What the first moments cost says nothing of the run.
-        telling = now - self._start[0] > _TELLING_SECONDS or simulated >= _TELLING_SHARE * self._total
-        if simulated > 0.0 and telling:
-            cost = (now - self._start[0]) / simulated
+        elapsed = now - self._start[0]
+        known = elapsed > _SECONDS_BEFORE_SPEED or simulated >= _SHARE_BEFORE_SPEED * self._total
+        if simulated > 0.0 and known:
+            cost = elapsed / simulated
             line += f"  {cost:.{0 if cost >= 100.0 else 1}f} ms per ms"
             if self._time < self._total:
                 line += f"  {_duration(cost * (self._total - self._time))} left"
         return line
 
     def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
+        if not say(text, self._stream):
+            self._quiet = True
 
 
 def _duration(seconds: float) -> str:
-    """A span of time to read at a glance: 42 s, 3:07 min, 5:03 h."""
+    """A span of time as it is read most easily: 42 s, 3:07 min, 5:03 h."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"

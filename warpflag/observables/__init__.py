@@ -6,7 +6,7 @@ Row i of a flagellum's directors belongs to segment i, which joins r_{i-1} and r
 "The paper" is Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015). Units um, pN, s.
 
 Functions of a window take consecutive frames, and the rates are differences over that window: instantaneous
-velocities of a stiff model carry fast modes that say nothing about swimming.
+velocities of a stiff model contain fast modes that do not move the cell.
 
 `warpflag.observables.recorded` has the same measures on the record of a run.
 """

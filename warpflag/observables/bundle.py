@@ -5,50 +5,62 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from warpflag.observables.arrays import Array, flagella
 
 __all__ = ["BUNDLE_DISTANCE", "STRAY", "ZIPPED", "bundle_length", "bundled_fraction", "bundled_nodes", "zip_time"]
 
 BUNDLE_DISTANCE = 0.44
-"""Twice the radius of the normal flagellar helix, 2R [um]: a node this near to another one is bundled."""
+"""Twice the radius of the normal flagellar helix, 2R [um]: a node this near to another flagellum is bundled."""
 STRAY = 1.0
-"""Contour length [um] outside the distance that a steady measure of the bundle passes over."""
+"""Contour length [um] outside that distance which does not yet end a bundle in figures and zip times."""
 ZIPPED = 0.98
 """Bundle length from which the zip counts as complete."""
 
-_PAIRS_PER_BLOCK = 1 << 15  # point-segment pairs held at once: temporary arrays that fit the cache
+_PAIRS_AT_ONCE = 1 << 15  # of nodes and segments: temporary arrays that fit the cache
 
 
 def bundled_nodes(
-    positions: Array, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE
+    positions: ArrayLike,
+    first_node: NDArray[np.integer],
+    distance: float = BUNDLE_DISTANCE,
+    *,
+    pairs_at_once: int = _PAIRS_AT_ONCE,
 ) -> NDArray[np.bool_]:
-    """Which nodes lie within `distance` [um] of the segments 1..N of any other flagellum; shape [node_count].
+    """Which nodes lie near the segments 1..N of any other flagellum, shape [node_count].
 
-    The distance is the least one from the node to the centre line. Source: the paper's bundled portion,
-    "within a distance 2R". positions: nodes [um], shape [node_count, 3].
+    The distance is the least one from the node to the centre line.
+
+    Args:
+        positions: nodes [um], shape [node_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+        distance: up to which a node counts as near [um].
+        pairs_at_once: pairs of a node and a segment whose distances are held in memory; changes no result.
+
+    Source:
+        the paper's bundled portion, "within a distance 2R".
     """
-    positions = np.asarray(positions, float)
-    positions = positions - positions.mean(axis=0)  # keeps the squares below small far from the origin
+    nodes: Array = np.asarray(positions, float)
+    nodes = nodes - nodes.mean(axis=0)  # keeps the squares below small far from the origin
     bounds = [int(i) for i in np.asarray(first_node)]
-    bundled = np.zeros(len(positions), dtype=bool)
-    edges = np.diff(positions, axis=0)
+    bundled = np.zeros(len(nodes), dtype=bool)
+    edges = np.diff(nodes, axis=0)
     is_segment = np.ones(len(edges), dtype=bool)
     is_segment[np.asarray(bounds[1:-1], dtype=int) - 1] = False  # tip of one, r_0 of the next
     for first, end in pairwise(bounds):
         others = is_segment.copy()
         others[first : end - 1] = False
-        starts, vectors = positions[:-1][others], edges[others]
-        rows = max(1, _PAIRS_PER_BLOCK // max(1, len(starts)))
+        starts, vectors = nodes[:-1][others], edges[others]
+        rows = max(1, pairs_at_once // max(1, len(starts)))
         for row in range(first, end, rows):
             stop = min(row + rows, end)
-            bundled[row:stop] = _near_segments(positions[row:stop], starts, vectors, distance)
+            bundled[row:stop] = _near_segments(nodes[row:stop], starts, vectors, distance)
     return bundled
 
 
 def _near_segments(points: Array, starts: Array, vectors: Array, distance: float) -> NDArray[np.bool_]:
-    """Which points lie within `distance` of any segment start + s vector, s in [0, 1]."""
+    """Which points, shape [count, 3], lie within `distance` of any segment start + s vector, s in [0, 1]."""
     squared_lengths = np.vecdot(vectors, vectors)
     inverse = 1.0 / np.maximum(squared_lengths, np.finfo(float).tiny)
     # With along = (p - start).vector, the squared distance is |p - start|^2 - s (2 along - s |vector|^2).
@@ -64,7 +76,7 @@ def _near_segments(points: Array, starts: Array, vectors: Array, distance: float
 
 
 def bundled_fraction(
-    positions: Array, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
+    positions: ArrayLike, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
 ) -> Array:
     """Bundled part of each flagellum as a fraction of its length, shape [flagellum_count].
 
@@ -72,9 +84,13 @@ def bundled_fraction(
     run of bundled nodes (see `bundled_nodes`), over N; 0 without such a run. The anchors themselves may lie
     outside the distance, so the run need not start at r_0.
 
-    gap: contour length [um], rounded to whole segments, that may lie outside the distance without ending the run. By
-    the plain rule, 0, one node that strays, in or out, resets the length: near the body, where the flagella cross,
-    some come within the distance now and then before the bundle begins.
+    Args:
+        positions: nodes [um], shape [node_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+        distance: up to which a node counts as bundled [um].
+        gap: contour length that may lie outside the distance without ending the run [um], rounded to whole segments.
+            With 0, one node that is near or far by itself sets the length anew: near the body, where the flagella
+            cross, some come within the distance now and then before the bundle begins.
     """
     positions = np.asarray(positions, float)
     bundled = bundled_nodes(positions, first_node, distance)
@@ -90,22 +106,30 @@ def bundled_fraction(
 
 
 def bundle_length(
-    positions: Array, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
+    positions: ArrayLike, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
 ) -> float:
-    """Bundle length l_r of one frame in [0, 1]: mean of `bundled_fraction` over the flagella.
+    """Bundle length l_r of one frame in [0, 1]: mean of `bundled_fraction` over the flagella; 0 with one flagellum.
 
-    Source: the paper, Fig. 3(b), which measures it from the cell body to the bundle front over the axial
-    length. 0 with one flagellum. positions: nodes [um], shape [node_count, 3]. gap: as there [um]; records hold the
-    plain rule, 0; figures take 1 um, `STRAY`.
+    Args:
+        positions: nodes [um], shape [node_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+        distance: up to which a node counts as bundled [um].
+        gap: contour length that may lie outside the distance [um]; records hold l_r with 0, figures take `STRAY`.
+
+    Source:
+        the paper, Fig. 3(b), which measures it from the cell body to the bundle front over the axial length.
     """
     return float(bundled_fraction(positions, first_node, distance, gap).mean())
 
 
-def zip_time(times: Array, bundle_lengths: Array, hold: float = 0.0) -> float:
-    """When the zip is complete: the first frame from which on l_r >= 0.98 for at least `hold` [s]; NaN if never.
+def zip_time(times: ArrayLike, bundle_lengths: ArrayLike, hold: float = 0.0) -> float:
+    """When the zip is complete [s]: the first frame from which on l_r >= 0.98 long enough; NaN if never.
 
-    With hold = 0 the first touch counts, also where two flagella that do not repel pass through each other.
-    times: [s], shape [frame_count]. bundle_lengths: l_r, same shape.
+    Args:
+        times: of the frames [s], shape [frame_count].
+        bundle_lengths: l_r, same shape.
+        hold: how long l_r must stay there [s]. With 0 the first touch counts, also where two flagella that do not
+            repel pass through each other.
     """
     times = np.asarray(times, float)
     zipped = np.concatenate([[False], np.asarray(bundle_lengths) >= ZIPPED, [False]])

@@ -6,46 +6,63 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW, PARALLEL
 
 from warpflag.observables.arrays import Array, flagella
 
 __all__ = ["closest_parameters", "steric_force", "steric_force_density"]
 
-_CUTOFF = 2.0 ** (1.0 / 6.0)  # in diameters
-_LINEAR_BELOW = 0.7
 
-
-def steric_force(distance: Array, strength: float, diameter: float) -> Array:
+def steric_force(distance: ArrayLike, strength: float, diameter: float) -> Array:
     """Repulsion of two centre lines [pN]: F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, else 0.
 
     The derivative of the paper's truncated Lennard-Jones potential; below 0.7 sigma it continues along its tangent.
-    distance: r [um]. strength: F_0 [pN]. diameter: sigma [um].
+
+    Args:
+        distance: r [um], any shape.
+        strength: F_0 [pN].
+        diameter: sigma [um].
+
+    Returns:
+        forces, shape of `distance`.
     """
     x = np.asarray(distance, float) / diameter
-    y = np.maximum(x, _LINEAR_BELOW)
-    slope = 26.0 * _LINEAR_BELOW**-14 - 7.0 * _LINEAR_BELOW**-8
+    y = np.maximum(x, LINEAR_BELOW)
+    slope = 26.0 * LINEAR_BELOW**-14 - 7.0 * LINEAR_BELOW**-8
     force = 2.0 * y**-13 - y**-7 + slope * (y - x)
-    return np.where(x < _CUTOFF, strength * force, 0.0)
+    return np.where(x < CUTOFF, strength * force, 0.0)
 
 
 def closest_parameters(p: Array, d: Array, q: Array, e: Array) -> tuple[Array, Array]:
-    """Parameters s, t in [0, 1] of the closest points of segments p + s d and q + t e, shape [...].
+    """Parameters s, t in [0, 1] of the closest points of segments p + s d and q + t e.
 
-    Parallel segments, which have many, are taken at s = 1/2. p, d, q, e: shape [..., 3], broadcast together.
+    Parallel segments, which have many, are taken at s = 1/2.
+
+    Args:
+        p: starts of the first segments [um], shape [..., 3]; all four are broadcast together.
+        d: from start to end of the first segments [um].
+        q: starts of the second segments [um].
+        e: from start to end of the second segments [um].
+
+    Returns:
+        s and t, shape [...] each.
     """
     r = p - q
     dd, ee, de, dr, er = np.vecdot(d, d), np.vecdot(e, e), np.vecdot(d, e), np.vecdot(d, r), np.vecdot(e, r)
-    determinant = dd * ee - de * de
-    skew = determinant > 1e-7 * dd * ee
-    s = np.where(skew, np.clip((de * er - dr * ee) / np.where(skew, determinant, 1.0), 0.0, 1.0), 0.5)
+    # Through the cross product: dd ee - de^2 would lose the digits of nearly parallel segments.
+    normal = np.cross(d, e)
+    square = np.vecdot(normal, normal)
+    skew = square > PARALLEL * dd * ee
+    s = np.vecdot(np.cross(e, r), normal) / np.where(skew, square, 1.0)
+    s = np.where(skew, np.clip(s, 0.0, 1.0), 0.5)
     t = (de * s + er) / ee
     s = np.where(t < 0.0, np.clip(-dr / dd, 0.0, 1.0), np.where(t > 1.0, np.clip((de - dr) / dd, 0.0, 1.0), s))
     return s, np.clip(t, 0.0, 1.0)
 
 
 def steric_force_density(
-    positions: Array,
+    positions: ArrayLike,
     first_node: NDArray[np.integer],
     strength: float,
     diameter: float,
@@ -60,7 +77,13 @@ def steric_force_density(
     sides cancel; "net" is the magnitude of the summed force on a flagellum. The last two are means over the flagella.
     None of them converges with the segment length: compare shapes, not values.
 
-    positions: nodes [um], shape [node_count, 3]. strength: F_0 [pN]. diameter: sigma [um]. length: L [um].
+    Args:
+        positions: nodes [um], shape [node_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+        strength: F_0 [pN].
+        diameter: sigma [um].
+        length: L [um].
+        rule: how forces are counted.
     """
     positions = np.asarray(positions, float)
     forces, total = np.zeros_like(positions), 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from warpflag.observables.arrays import Array
 
@@ -14,17 +14,25 @@ __all__ = ["local_phase_difference", "phase_difference", "segment_tangents"]
 _ANTIPARALLEL = 1e-12  # of 1 + cos: tangents within 1.4e-6 rad of antiparallel have no minimal rotation
 
 
-def local_phase_difference(e1_a: Array, tangents_a: Array, e1_b: Array, tangents_b: Array) -> Array:
+def local_phase_difference(e1_a: ArrayLike, tangents_a: ArrayLike, e1_b: ArrayLike, tangents_b: ArrayLike) -> Array:
     """Local phase difference of two flagella, segment by segment: theta(i) = arccos(e1(i) . e1~*(i)) / pi.
 
     e1~* is the e1 of flagellum b after the minimal rotation that takes its tangent onto the tangent of
-    flagellum a. Exchanging the flagella changes nothing. Source: the paper, text above its Fig. 3.
+    flagellum a. Exchanging the flagella changes nothing.
 
-    e1_a, e1_b: material directors e1, unit, across the tangents; shape [..., segment_count, 3], broadcast
-    together. tangents_a, tangents_b: unit tangents e3, same shapes.
+    Args:
+        e1_a: directors e1 of flagellum a, unit, across the tangents, shape [..., segment_count, 3]; all four are
+            broadcast together.
+        tangents_a: unit tangents e3 of flagellum a.
+        e1_b: directors e1 of flagellum b.
+        tangents_b: unit tangents e3 of flagellum b.
 
-    Returns theta in [0, 1], shape [..., segment_count]: 0 in phase, 1 in antiphase. Where the tangents are
-    antiparallel no rotation is minimal and theta is undefined: NaN there, which the averages leave out.
+    Returns:
+        theta in [0, 1], shape [..., segment_count]: 0 in phase, 1 in antiphase. Where the tangents are antiparallel
+        no rotation is minimal and theta is undefined: NaN there, which the averages leave out.
+
+    Source:
+        the paper, text above its Fig. 3.
     """
     e1_a, tangents_a = np.asarray(e1_a, float), np.asarray(tangents_a, float)
     e1_b, tangents_b = np.asarray(e1_b, float), np.asarray(tangents_b, float)
@@ -40,22 +48,36 @@ def local_phase_difference(e1_a: Array, tangents_a: Array, e1_b: Array, tangents
     return np.abs(np.arctan2(along_e2, along_e1)) / np.pi
 
 
-def segment_tangents(positions: Array) -> Array:
-    """Unit tangents of the segments 1..N of one flagellum with nodes `positions` [um], [..., N + 1, 3]."""
+def segment_tangents(positions: ArrayLike) -> Array:
+    """Unit tangents of the segments 1..N of one flagellum, shape [..., N, 3].
+
+    Args:
+        positions: nodes [um], shape [..., N + 1, 3].
+    """
     edges = np.diff(np.asarray(positions, float), axis=-2)
     return edges / np.sqrt(np.vecdot(edges, edges))[..., None]
 
 
-def phase_difference(positions: Array, directors: Array, first_node: NDArray[np.integer]) -> float:
+def phase_difference(positions: ArrayLike, directors: ArrayLike, first_node: NDArray[np.integer]) -> float:
     """Contour-averaged phase difference <theta> in [0, 1] of one frame, mean over all pairs of flagella.
 
     theta(i) of `local_phase_difference` is averaged over the segments 1..N of a pair (segments are paired by
     their number from the motor; of unequal flagella the common part counts), then over the pairs. Undefined
-    segments are left out. Source: the paper, Fig. 3(a).
+    segments are left out.
 
-    positions: nodes [um], shape [node_count, 3]. directors: e1 of tripod and segments, shape [node_count, 3].
+    Args:
+        positions: nodes [um], shape [node_count, 3].
+        directors: e1 of tripod and segments, shape [node_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
 
-    Returns NaN where no segment of any pair is defined. Raises ValueError with fewer than two flagella.
+    Returns:
+        <theta>; NaN where no segment of any pair is defined.
+
+    Raises:
+        ValueError: fewer than two flagella.
+
+    Source:
+        the paper, Fig. 3(a).
     """
     positions, directors = np.asarray(positions, float), np.asarray(directors, float)
     bounds = [int(i) for i in np.asarray(first_node)]

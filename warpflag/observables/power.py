@@ -1,4 +1,4 @@
-"""Where the work of motors and of forces from outside goes."""
+"""The power balance of a cell: the work of motors and external forces, what the fluid dissipates, what is stored."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ class PowerBalance:
 
     @property
     def motor(self) -> float:
-        """Work of all motors."""
+        """Work of all motors [pN um/s]."""
         return self.supplied["motor"]
 
     @property
     def dissipated(self) -> float:
-        """What the fluid takes."""
+        """What the fluid takes [pN um/s]."""
         return self.translation + self.spin + self.body
 
     @property
     def stored(self) -> float:
-        """What is left of the supply: the rate at which elastic and steric energy grow."""
+        """What is left of the supply: the rate at which elastic and steric energy grow [pN um/s]."""
         return sum(self.supplied.values()) - self.dissipated
 
 

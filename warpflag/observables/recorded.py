@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from warpflag.base import rotations
 from warpflag.observables import bundle, contact, motion, phase, shape
-from warpflag.observables.arrays import Array, elapsed, flagella, unit
+from warpflag.observables.arrays import Array, elapsed, flagella
 from warpflag.record import Record
 from warpflag.scene import Scene, loads
 
@@ -24,7 +25,16 @@ __all__ = [
 
 
 def phase_profile(record: Record, a: int = 0, b: int = 1) -> Array:
-    """theta(i) of flagella a and b, shape [frame_count, segment_count of the shorter]; see `local_phase_difference`."""
+    """Local phase difference theta(i) of two flagella, shape [frame_count, segment_count of the shorter].
+
+    Args:
+        record: of the run.
+        a: number of one flagellum.
+        b: number of the other.
+
+    Raises:
+        RecordError: the record can't be read.
+    """
     first, second = (_rows(record, k) for k in (a, b))
     count = min(first.stop - first.start, second.stop - second.start)
     positions, directors = record.positions[:], record.directors[:]
@@ -35,13 +45,29 @@ def phase_profile(record: Record, a: int = 0, b: int = 1) -> Array:
 
 
 def bundle_lengths(record: Record, gap: float = 0.0) -> Array:
-    """l_r of every frame, shape [frame_count]; passing over a gap [um]; with 0 what the record itself holds."""
+    """Bundle length l_r of every frame, shape [frame_count].
+
+    Args:
+        record: of the run.
+        gap: contour length that does not end a bundle [um], as in `bundle_length`; with 0 it is what records hold.
+
+    Raises:
+        RecordError: the record can't be read.
+    """
     first_node = record.first_node
     return np.array([bundle.bundle_length(x, first_node, gap=gap) for x in record.positions[:]])
 
 
 def steric_force_densities(record: Record, rule: Literal["pairs", "nodes", "net"] = "pairs") -> Array:
-    """f_c of every frame by one of the rules [pN/um], shape [frame_count]; see `steric_force_density`."""
+    """Steric force density f_c of every frame [pN/um], shape [frame_count].
+
+    Args:
+        record: of the run.
+        rule: how forces are counted, as in `steric_force_density`.
+
+    Raises:
+        RecordError: the record can't be read.
+    """
     scene, first_node = loads(record.scene_text), record.first_node
     if not scene.steric.enabled:
         return np.zeros(record.frame_count)
@@ -53,14 +79,26 @@ def steric_force_densities(record: Record, rule: Literal["pairs", "nodes", "net"
 
 
 def strains(record: Record, flagellum: int = 0) -> Array:
-    """Omega_1, Omega_2, Omega_3 at the joints of segments 1..N of a flagellum [1/um], [frame_count, N - 1, 3]."""
+    """Omega_1, Omega_2, Omega_3 at the joints of segments 1..N of a flagellum [1/um], [frame_count, N - 1, 3].
+
+    Args:
+        record: of the run.
+        flagellum: its number.
+
+    Raises:
+        RecordError: the record can't be read.
+    """
     rows, h = _rows(record, flagellum), loads(record.scene_text).resolved_flagella()[flagellum].segment_length
     tangents = phase.segment_tangents(record.positions[:][:, rows])
     return shape.strain(tangents, record.directors[:][:, rows][:, 1:], h)
 
 
 def elastic_energies(record: Record) -> Array:
-    """Bending, twist and stretching energy of every frame [pN um], shape [frame_count, 3]."""
+    """Bending, twist and stretching energy of every frame [pN um], shape [frame_count, 3].
+
+    Raises:
+        RecordError: the record can't be read.
+    """
     scene, first_node = loads(record.scene_text), record.first_node
     axes = _motor_axes_in_lab(record, scene)
     frames = zip(record.positions[:], record.directors[:], axes, strict=True)
@@ -69,14 +107,16 @@ def elastic_energies(record: Record) -> Array:
 
 @dataclass(frozen=True)
 class Swimming:
-    """What a cell does over a window of its record. Rates by difference over the window; see the functions named.
+    """How a cell swims over a window of its record. Rates are differences over the window.
 
     Attributes:
-        start, stop: first and last frame of the window [s].
+        start: time of the first frame of the window [s].
+        stop: time of the last frame [s].
         body_speed: along the body axis, forward [um/s].
         net_speed: displacement over time [um/s].
         body_rate: of the body about its axis, which points to the rear [Hz].
-        motor_rate, motor_rate_lab: of the motors relative to the body and in the lab [Hz], shape [flagellum_count].
+        motor_rate: of the motors relative to the body [Hz], shape [flagellum_count].
+        motor_rate_lab: of the motors in the lab [Hz], shape [flagellum_count].
         helix_rate: of the flagella about their helix axes in the lab [Hz], shape [flagellum_count].
         pitch: of the flagella, negative for left-handed [um], mean over flagella and frames.
         phase_velocity: v_e, from pitch and mean helix rate [um/s].
@@ -103,9 +143,16 @@ class Swimming:
 
 
 def swimming(record: Record, start: float | None = None, stop: float | None = None) -> Swimming:
-    """Measures a window of a record, from `start` to `stop` [s]; default: the last third.
+    """Measures a window of a record.
 
-    Raises ValueError where it holds fewer than two frames.
+    Args:
+        record: of the run.
+        start: of the window [s]; default: after two thirds of the run.
+        stop: of the window [s]; default: the end of the run.
+
+    Raises:
+        ValueError: the window holds fewer than two frames.
+        RecordError: the record can't be read.
     """
     scene, first_node, times = loads(record.scene_text), record.first_node, record.times
     window = _window(record, start, stop)
@@ -148,7 +195,5 @@ def _rows(record: Record, flagellum: int) -> slice:
 
 
 def _motor_axes_in_lab(record: Record, scene: Scene) -> Array:
-    """m of every frame and flagellum, shape [frame_count, flagellum_count, 3]."""
-    q, axes = unit(record.body_orientation), motion.motor_axes(scene)
-    vector, w = np.broadcast_to(q[:, None, :3], (len(q), *axes.shape)), q[:, None, 3:]
-    return axes + 2 * w * np.cross(vector, axes) + 2 * np.cross(vector, np.cross(vector, axes))
+    """Motor axes m of every frame and flagellum, unit vectors, shape [frame_count, flagellum_count, 3]."""
+    return rotations.rotated(record.body_orientation, motion.motor_axes(scene))

@@ -27,20 +27,25 @@ __all__ = [
 def strain(tangents: Array, directors: Array, segment_length: float) -> Array:
     """Curvatures and twist along one flagellum: Omega_1, Omega_2, Omega_3 of every joint [1/um], [..., count - 1, 3].
 
-    Curvature is |(Omega_1, Omega_2)|, twist Omega_3; the ground state has (0, 1.3, -2.1). Discrete elastic rods
-    (Bergou et al. 2008): with the curvature binormal kb = 2 t x u/(1 + t.u) of the tangents t, u before and after,
-    h Omega_1,2 = kb . (mean e1, mean e2), and h Omega_3 the angle from e1, carried along by the minimal rotation of t
-    onto u, to the next e1.
+    Curvature is |(Omega_1, Omega_2)|, twist Omega_3; the ground state has (0, 1.3, -2.1). With the curvature binormal
+    kb = 2 t x u/(1 + t.u) of the tangents t, u before and after, h Omega_1,2 = kb . (mean e1, mean e2), and h Omega_3
+    is the angle from e1, after parallel transport by the minimal rotation of t onto u, to the next e1.
 
-    tangents, directors: e3 and e1 of consecutive segments, shape [..., count, 3]; with the motor tripod first, row 0 of
-    the result is the hook. segment_length: h at rest [um].
+    Args:
+        tangents: e3 of consecutive segments, shape [..., count, 3]; with the motor tripod first, row 0 of the result
+            is the hook.
+        directors: e1 of the same segments, same shape.
+        segment_length: h at rest [um].
+
+    Source:
+        discrete elastic rods, Bergou et al., ACM Trans. Graph. 27, 63 (2008).
     """
     tangents, directors = np.asarray(tangents, float), np.asarray(directors, float)
     t, u, a, b = tangents[..., :-1, :], tangents[..., 1:, :], directors[..., :-1, :], directors[..., 1:, :]
     one_plus_cos = 1.0 + np.vecdot(t, u)
     binormal = np.cross(t, u) * (2.0 / one_plus_cos)[..., None]
-    carried = a - (np.vecdot(u, a) / one_plus_cos)[..., None] * (t + u)
-    twist = np.arctan2(np.vecdot(np.cross(carried, b), u), np.vecdot(carried, b))
+    transported = a - (np.vecdot(u, a) / one_plus_cos)[..., None] * (t + u)
+    twist = np.arctan2(np.vecdot(np.cross(transported, b), u), np.vecdot(transported, b))
     bend = [np.vecdot(binormal, a + b) / 2, np.vecdot(binormal, np.cross(t, a) + np.cross(u, b)) / 2]
     return np.stack([*bend, twist], axis=-1) / segment_length
 
@@ -50,9 +55,17 @@ def elastic_energy(
 ) -> Array:
     """Elastic energy of all flagella by term: bending, twist (with the hook's), stretching [pN um], shape [3].
 
-    Source: the paper's Kirchhoff energy, discretised as in `strain`; the stretching energy has a rest length,
-    (K h/2)(|dr|/h - 1)^2. positions, directors: shape [node_count, 3]; motor_axes: e3 of the tripods in the lab, shape
-    [flagellum_count, 3].
+    Bending and twist are discretised as in `strain`; stretching is (K h/2)(|dr|/h - 1)^2.
+
+    Args:
+        scene: gives the elastic constants and segment lengths.
+        positions: nodes [um], shape [node_count, 3].
+        directors: e1 of tripod and segments, shape [node_count, 3].
+        motor_axes: e3 of the tripods in the lab, shape [flagellum_count, 3].
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+
+    Source:
+        the paper's Kirchhoff energy; its stretching energy has no rest length, this one has.
     """
     group, energy = scene.flagella, np.zeros(3)
     for spec, rows, axis in zip(scene.resolved_flagella(), flagella(first_node), motor_axes, strict=True):
@@ -70,9 +83,12 @@ def elastic_energy(
 
 
 def helix_axis(tangents: Array) -> Array:
-    """Axis of a helix from the tangents of its segments, [..., count, 3], pointing along it; shape [..., 3].
+    """Axis of a helix, pointing along it from first to last segment, unit vectors, shape [..., 3].
 
     The direction to which the tangents keep the most even angle: along it their covariance is least.
+
+    Args:
+        tangents: unit tangents of its segments, shape [..., count, 3].
     """
     tangents = np.asarray(tangents, float)
     mean = tangents.mean(axis=-2, keepdims=True)
@@ -85,7 +101,8 @@ def helix_axis(tangents: Array) -> Array:
 def helix_pitch(positions: Array) -> float:
     """Advance along the helix axis per turn of the tangents about it [um], negative for a left-handed helix.
 
-    positions: nodes of one flagellum [um], shape [N + 1, 3]; a segment must turn by less than half a turn.
+    Args:
+        positions: nodes of one flagellum [um], shape [N + 1, 3]; a segment must turn by less than half a turn.
     """
     edges = np.diff(np.asarray(positions, float), axis=0)
     axis = helix_axis(unit(edges))
@@ -95,10 +112,16 @@ def helix_pitch(positions: Array) -> float:
 
 
 def phase_velocity(pitch: float, rate: float) -> float:
-    """Speed v_e of the helical wave away from the body [um/s]: v_e = lambda_f nu_f of the paper's zipper.
+    """Speed v_e of the helical wave away from the body [um/s].
 
-    pitch: with its sign, negative for a left-handed helix [um]. rate: of the rotation about the axis [Hz]; a
-    left-handed helix that turns positive sends its wave away from the body.
+    A left-handed helix that turns positive sends its wave away from the body.
+
+    Args:
+        pitch: with its sign, negative for a left-handed helix [um].
+        rate: of the rotation about the axis [Hz].
+
+    Source:
+        v_e = lambda_f nu_f of the paper's zipper.
     """
     return -pitch * rate
 
@@ -110,7 +133,9 @@ def winding_number(positions_a: Array, positions_b: Array) -> float:
     spans, exact for straight segments. Positive where they wind right-handed; for open curves it need not be
     whole, and it jumps by 1 when one passes through the other. The curves must not touch.
 
-    positions_a, positions_b: nodes [um], shapes [N_a + 1, 3] and [N_b + 1, 3].
+    Args:
+        positions_a: nodes of one flagellum [um], shape [N_a + 1, 3].
+        positions_b: nodes of the other [um], shape [N_b + 1, 3].
     """
     a, b = np.asarray(positions_a, float), np.asarray(positions_b, float)
     vectors = a[:, None, :] - b[None, :, :]
@@ -119,7 +144,11 @@ def winding_number(positions_a: Array, positions_b: Array) -> float:
 
 
 def _solid_angle(a: Array, b: Array, c: Array) -> Array:
-    """Signed solid angle of the triangles a, b, c seen from the origin (van Oosterom & Strackee 1983)."""
+    """Signed solid angle of the triangles with corners a, b, c seen from the origin [sr], shapes [..., 3] to [...].
+
+    Source:
+        van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 125 (1983).
+    """
     la, lb, lc = (np.sqrt(np.vecdot(v, v)) for v in (a, b, c))
     denominator = la * lb * lc + np.vecdot(a, b) * lc + np.vecdot(b, c) * la + np.vecdot(c, a) * lb
     return 2.0 * np.arctan2(np.vecdot(a, np.cross(b, c)), denominator)
@@ -131,8 +160,10 @@ def turns_about_axis(points: Array, origin: ArrayLike, axis: ArrayLike) -> float
     Taken along a flagellum it is negative for a left-handed helix; taken along the frames of one node it
     counts the turns of that node. Right as long as two successive points are less than half a turn apart.
 
-    points: [um], shape [count, 3]. origin: a point of the axis [um], shape [3]. axis: its direction, shape
-    [3].
+    Args:
+        points: of the chain [um], shape [count, 3].
+        origin: a point of the axis [um], shape [3].
+        axis: its direction, shape [3].
     """
     axis = unit(axis)
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

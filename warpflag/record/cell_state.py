@@ -1,4 +1,4 @@
-"""What a simulation hands out of one cell: where it is, and what acts on it. Arrays on the host, lab coordinates."""
+"""The state of one cell, and its forces and velocities: NumPy arrays in lab coordinates."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ __all__ = ["CellState", "Evaluation"]
 
 @dataclass(frozen=True)
 class CellState:
-    """One cell at one time, on the host, in lab coordinates.
+    """One cell at one time, as NumPy arrays in lab coordinates.
 
     Attributes:
-        time: [s].
-        step: steps taken.
+        time: simulated time [s].
+        step: number of steps taken.
         positions: nodes [um], shape [node_count, 3], flagellum after flagellum, r_0..r_N each.
         directors: e1 of the tripod and the segments, shape [node_count, 3].
         tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
         motor_angle: accumulated turn of each motor relative to the body [rad], shape [flagellum_count].
         body_angle: accumulated turn of the body about its axis e_b3 [rad].
-        body_position: [um], shape [3].
-        body_orientation: quaternion (x, y, z, w), shape [4].
+        body_position: centre of the body [um], shape [3].
+        body_orientation: quaternion (x, y, z, w) from body to lab axes, shape [4].
         elastic_energy: bending, twist, stretching [pN um], shape [3].
         steric_force: sum of the contact forces between flagella, each pair once [pN].
     """
@@ -51,15 +51,17 @@ class Evaluation:
     """Forces and velocities of one cell at its present state.
 
     Attributes:
-        forces: on the nodes [pN], shape [node_count, 3]; on r_0: what the anchor hands to the body.
+        forces: on the nodes [pN], shape [node_count, 3]; on r_0 that of the anchor on the body.
         torques: on the spins about the tangents [pN um], shape [node_count].
         velocities: of the nodes in the lab [um/s], shape [node_count, 3].
         spins: of the segments about their tangents [rad/s], shape [node_count].
         tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
         first: index of r_0 of every flagellum, shape [flagellum_count].
-        supplied: power that motors and forces from outside bring in [pN um/s], by the name of the term.
-        body_force, body_torque: on the body, all shares [pN], [pN um], shape [3]; torque about its centre.
-        body_velocity, body_spin: of the body [um/s], [rad/s], shape [3].
+        supplied: power of motors and of external forces [pN um/s], by the name of the term.
+        body_force: sum of the forces on the body [pN], shape [3].
+        body_torque: sum of the torques on the body about its centre [pN um], shape [3].
+        body_velocity: of the body's centre [um/s], shape [3].
+        body_spin: angular velocity of the body [rad/s], shape [3].
     """
 
     forces: np.ndarray

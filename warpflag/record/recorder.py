@@ -1,61 +1,80 @@
-"""Writes the record of a run, run.h5 (layout: see warpflag.record), so that a killed run leaves it readable.
+"""Writes the record of a run, run.h5, so that a run that is killed or runs out of disk space leaves it readable.
 
 A block of frames is written and flushed first, `step` after it: its length is the number of committed frames,
 and a reader cuts everything else to it. Nothing is compressed: a compressed chunk that grows is moved, and
 processes killed meanwhile left committed frames unreadable (10 of 120 that wrote without pause, against 0 of
-380 uncompressed).
+380 uncompressed). The layout of the file is described in `warpflag.record.layout`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warpflag.record.record import (
-    BODY_ORIENTATION,
-    BODY_POSITION,
-    E1,
-    ENTRIES,
-    MOTOR_ANGLE,
-    POSITION,
+from warpflag.base.output import DiskError
+from warpflag.record.disk import DiskFile
+from warpflag.record.layout import (
+    CHECKSUMS,
     Frame,
-    Record,
     RecordError,
+    checksum,
     dataset_path,
     one_line,
+    parameters_checksum,
+    summed_entries,
 )
+from warpflag.record.new_record import FORMAT, add_parameters, first_image, growth, values_of
+from warpflag.record.record import Record
 
 __all__ = ["Recorder"]
 
-_BLOCK_FRAMES = 10
 _BLOCK_SECONDS = 2.0
-_CHUNK_BYTES = 1 << 20
 
 
 class Recorder:
     """Reporter that writes run.h5: start, write frame by frame, flush, close.
 
-    Frames are committed in blocks of 10, or once 2 s have passed since the last block; the first frame at
-    once. After an exception (Ctrl-C) close() commits what is pending.
+    Frames are committed in blocks, or once 2 s have passed since the last block; the first frame at once. After an
+    exception (Ctrl-C) close() commits what is pending.
 
-    path: the file to write. It must not exist, unless resume_step is given: then the frames whose step is
-    larger are cut off and new ones appended.
+    Args:
+        path: the file to write. It must not exist, unless `resume_step` is given.
+        resume_step: continue an existing file: frames whose step is larger are cut off and new ones appended.
+        block_frames: frames of a block.
+        keep_open: whether the file stays open and locked between blocks. If not, only full blocks and calls of `flush`
+            are committed: thousands of records can then be written at once.
+        clock: seconds that pass, for tests.
     """
 
-    def __init__(self, path: str | Path, *, resume_step: int | None = None):
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        resume_step: int | None = None,
+        block_frames: int = 10,
+        keep_open: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ):
         self.path = Path(path)
         self._resume_step = resume_step
+        self._block_frames, self._keep_open = block_frames, keep_open
+        self._clock = clock
+        self._started = False  # the file is there, open or not
         self._file: Any = None
+        self._disk: DiskFile | None = None
         self._parameters: dict[str, Any] = {}
         self._datasets: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
+        self._summed: list[str] = []  # entries in the order of their checksums
         self._committed = 0
         self._pending: list[dict[str, Any]] = []
         self._last_commit = float("-inf")  # so that the first frame is late
@@ -75,10 +94,20 @@ class Recorder:
         body_width: float,
         versions: Mapping[str, str] | None = None,
     ) -> None:
-        """Takes what /parameters holds, lengths in um.
+        """Takes what /parameters holds. A new file appears with its first frame; one to be continued is cut here.
 
-        A new file appears with its first frame; a file to be continued is cut here. Raises RecordError where
-        a new file exists already, or where a resumed one is missing or has other flagella.
+        Args:
+            scene_text: the scene as TOML.
+            first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+            filament_radius: of the flagella [um].
+            body_length: over the round ends [um].
+            body_width: of the body [um].
+            versions: of the program and the packages that it uses, by name.
+
+        Raises:
+            RecordError: a new file exists already; a resumed one is missing, damaged, has other flagella, or is being
+                written by another run.
+            DiskError: the file could not be written; it is as it was.
         """
         self._parameters = {
             "scene": scene_text,
@@ -87,7 +116,7 @@ class Recorder:
             "filament_radius": float(filament_radius),
             "body_length": float(body_length),
             "body_width": float(body_width),
-            "versions": dict(versions or {}),
+            "versions": {str(name): str(version) for name, version in (versions or {}).items()},
         }
         if self._resume_step is not None:
             self._reopen(self._resume_step)
@@ -97,131 +126,200 @@ class Recorder:
     def write(self, frame: Frame) -> None:
         """Appends a frame; its arrays are copied.
 
-        Raises ValueError where its shapes or observables are not those of the record.
+        Raises:
+            ValueError: its shapes or observables are not those of the record.
+            DiskError: a block of frames could not be written; all committed before stay readable.
         """
-        values = _values(frame)
-        if self._file is None:
+        values = values_of(frame)
+        if not self._started:
             self._create(values)
+            return
         shapes = {name: np.shape(value) for name, value in values.items()}
-        if shapes != self._shapes:
-            wrong = sorted(name for name, _ in shapes.items() ^ self._shapes.items())
+        expected = {name: shape for name, shape in self._shapes.items() if name != CHECKSUMS}
+        if shapes != expected:
+            wrong = sorted(name for name, _ in shapes.items() ^ expected.items())
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
         self._pending.append(values)
-        late = time.monotonic() - self._last_commit > _BLOCK_SECONDS
-        if late or len(self._pending) >= _BLOCK_FRAMES:
-            self.flush()
+        late = self._keep_open and self._clock() - self._last_commit > _BLOCK_SECONDS
+        if late or len(self._pending) >= self._block_frames:
+            self._commit()
 
     def flush(self) -> None:
-        """Commits the frames that are pending: from here on they survive the end of this process."""
+        """Commits the frames that are pending: from here on they survive the end of this process and a power cut.
+
+        Raises:
+            DiskError: they could not be written; all committed before stay readable.
+        """
+        if not self._started:
+            return
+        self._commit()
+        disk = self._disk or DiskFile(self.path)
+        try:
+            disk.sync()
+        finally:
+            if disk is not self._disk:
+                disk.close()
+
+    def close(self) -> None:
+        """Commits what is pending and closes the file; calling it again does nothing.
+
+        Raises:
+            DiskError: what was pending could not be written; the file is closed, all committed before is readable.
+        """
+        try:
+            self.flush()
+        finally:
+            self._started = False
+            self._release()
+
+    def _commit(self) -> None:
+        """Writes the pending frames and their checksums, flushes, and then writes `step`, the mark of the commit."""
         if not self._pending:
             return
+        if self._file is None:
+            self._open(DiskFile(self.path), list(self._shapes))
+        assert self._disk is not None and self._file is not None
         # Rows start at the committed count, not at a dataset's end: a commit that was interrupted is
         # repeated.
         count = self._committed + len(self._pending)
-        for names in ([name for name in self._shapes if name != "step"], ["step"]):
-            for name in names:
-                dataset = self._datasets[name]
-                dataset.resize(count, axis=0)
-                dataset[self._committed :] = np.stack([values[name] for values in self._pending])
-            self._file.flush()
+        rows = {name: np.stack([values[name] for values in self._pending]) for name in self._pending[0]}
+        if CHECKSUMS in self._shapes:
+            sums = [[checksum(values[name]) for name in self._summed] for values in self._pending]
+            rows[CHECKSUMS] = np.array(sums, dtype=np.uint32)
+        self._disk.reserve(self._file.id.get_filesize() + growth(self._datasets.values(), self._committed, count))
+        try:
+            for group in ([name for name in self._shapes if name != "step"], ["step"]):
+                for name in group:
+                    dataset = self._datasets[name]
+                    dataset.resize(count, axis=0)
+                    dataset[self._committed :] = rows[name]
+                self._file.flush()
+        except (OSError, RuntimeError) as error:  # h5py raises either
+            self._abandon()
+            raise DiskError.of(self.path, error) from error
         self._committed = count
         self._pending = []
-        self._last_commit = time.monotonic()
+        self._last_commit = self._clock()
+        if not self._keep_open:
+            self._release()
 
-    def close(self) -> None:
-        """Commits what is pending and closes the file; calling it again does nothing."""
-        if self._file is not None:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
-                self._file = None
+    def _abandon(self) -> None:
+        """Closes HDF5's file after a write that failed; what it still writes goes nowhere, and can't fail again."""
+        self._started, self._pending = False, []
+        with contextlib.suppress(Exception):
+            size = self._file.id.get_filesize()
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(nowhere, self._file.id.get_vfd_handle())
+            os.close(nowhere)
+            if self._disk is not None:
+                self._disk.extend(size)
+        with contextlib.suppress(Exception):
+            self._release()
+
+    def _release(self) -> None:
+        file, disk = self._file, self._disk
+        self._file = self._disk = None
+        self._datasets = {}
+        try:
+            if file is not None:
+                size = file.id.get_filesize()
+                file.close()
+                if disk is not None:
+                    disk.trim(size)
+        finally:
+            if disk is not None:
+                disk.close()
 
     def _refuse_existing(self) -> None:
         if self.path.exists():
             raise RecordError(f"{self.path}: exists already")
 
     def _create(self, values: dict[str, Any]) -> None:
-        """Makes the file, datasets empty, under a temporary name: it is whole as soon as it is there."""
-        import h5py
+        """Makes the file with its first frame, in memory and then under a temporary name: it is never there in part.
 
+        Raises:
+            RecordError: the file exists.
+            DiskError: it could not be written; there is none then.
+        """
         self._refuse_existing()
-        first_node = self._parameters["first_node"]
-        expected = {
-            POSITION: (int(first_node[-1]), 3),
-            E1: (int(first_node[-1]), 3),
-            MOTOR_ANGLE: (len(first_node) - 1,),
-        }
-        for name, shape in expected.items():
-            if np.shape(values[name]) != shape:
-                raise ValueError(f"{name} of a frame has shape {np.shape(values[name])}, the scene's is {shape}")
+        image = first_image(values, self._parameters)
         temporary = self.path.with_name(self.path.name + ".tmp")
-        with h5py.File(temporary, "w") as file:
-            file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
-            file.create_group("h5md/author").attrs["name"] = "unknown"
-            creator = file.create_group("h5md/creator")
-            creator.attrs["name"] = "warpflag"
-            creator.attrs["version"] = self._parameters["versions"].get("warpflag", "unknown")
-            box = file.create_group("particles/flagella/box")
-            box.attrs["dimension"] = np.int32(3)
-            box.attrs["boundary"] = ["none"] * 3
-            # The shared datasets first, under the entry that every record has.
-            for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
-                shape, dtype = np.shape(values[name]), np.int64 if name == "step" else np.float64
-                chunk = int(np.clip(_CHUNK_BYTES // (8 * max(1, np.prod(shape, dtype=int))), 16, 64))
-                file.create_dataset(
-                    dataset_path(name), (0, *shape), dtype, maxshape=(None, *shape), chunks=(chunk, *shape)
-                )
-            for name in values.keys() - {"step", "time", POSITION}:
-                file[f"{name}/step"] = file[dataset_path("step")]
-                file[f"{name}/time"] = file[dataset_path("time")]
-            self._write_parameters(file)
-        os.replace(temporary, self.path)
-        self._file = h5py.File(self.path, "r+")
-        self._datasets = {name: self._file[dataset_path(name)] for name in values}
-        self._shapes = {name: np.shape(value) for name, value in values.items()}
+        try:
+            with open(temporary, "wb") as file:
+                file.write(image)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, self.path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise DiskError.of(self.path, error) from error
+        self._open(DiskFile(self.path), [*values, CHECKSUMS])
+        self._started, self._committed, self._last_commit = True, 1, self._clock()
+        if not self._keep_open:
+            self._release()
 
     def _reopen(self, resume_step: int) -> None:
-        """Opens the file again and cuts it to the frames with step <= resume_step."""
-        import h5py
-
+        """Opens an existing file and cuts it to the frames with step <= resume_step."""
         with Record(self.path) as record:
-            if not np.array_equal(record.first_node, self._parameters["first_node"]):
+            present = record.parameters
+            if not np.array_equal(present["first_node"], self._parameters["first_node"]):
                 raise RecordError(f"{self.path}: has other flagella than the run that would continue it")
             self._committed = int(np.searchsorted(record.steps, resume_step, side="right"))
-            names = ["step", "time", *ENTRIES, *(f"observables/{name}" for name in record.observables)]
+            names = list(record.entries)
+        disk = DiskFile(self.path)
+        if parameters_checksum(present) != parameters_checksum(self._parameters):
+            disk = self._with_new_parameters(disk)
         try:
-            self._file = h5py.File(self.path, "r+")
-        except OSError as error:
+            self._open(disk, names)
+            for name in ["step", *(name for name in names if name != "step")]:  # at no moment is a dataset shorter
+                self._datasets[name].resize(self._committed, axis=0)
+                self._file.flush()
+        except (OSError, RuntimeError) as error:  # h5py raises either
+            self._abandon()
             raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
-        for name in names:  # step first: at any moment no dataset is shorter
-            dataset = self._datasets[name] = self._file[dataset_path(name)]
-            dataset.resize(self._committed, axis=0)
-            self._file.flush()
-            self._shapes[name] = dataset.shape[1:]
-        del self._file["parameters"]
-        self._write_parameters(self._file)
-        self._file.flush()
-        self._last_commit = time.monotonic()
+        self._started, self._last_commit = True, self._clock()
+        if not self._keep_open:
+            self._release()
 
-    def _write_parameters(self, file: Any) -> None:
-        group = file.create_group("parameters")
-        for name, value in self._parameters.items():
-            if name == "versions":
-                group.create_group(name).attrs.update(value)
-            else:
-                group[name] = value
+    def _open(self, disk: DiskFile, names: list[str]) -> None:
+        """Opens the file for writing; `disk` holds its lock, so HDF5 needs none of its own."""
+        import h5py
 
+        self._disk = disk
+        self._file = h5py.File(self.path, "r+", locking=False, libver=FORMAT)
+        self._datasets = {name: self._file[dataset_path(name)] for name in names}
+        self._shapes = {name: tuple(dataset.shape[1:]) for name, dataset in self._datasets.items()}
+        if CHECKSUMS in self._datasets:
+            self._summed = summed_entries(self._datasets[CHECKSUMS])
 
-def _values(frame: Frame) -> dict[str, Any]:
-    """A copy of a frame by the names of its entries in the file."""
-    values = {
-        POSITION: frame.positions,
-        E1: frame.directors,
-        MOTOR_ANGLE: frame.motor_angle,
-        BODY_POSITION: frame.body_position,
-        BODY_ORIENTATION: frame.body_orientation,
-        "time": frame.time,
-        **{f"observables/{name}": value for name, value in frame.observables.items()},
-    }
-    return {"step": np.int64(frame.step), **{name: np.array(v, dtype=np.float64) for name, v in values.items()}}
+    def _with_new_parameters(self, disk: DiskFile) -> DiskFile:
+        """Replaces the file by a copy with the parameters of this run: they are changed all together or not at all.
+
+        Returns:
+            the copy, locked; `disk`, which was the file before, is closed.
+
+        Raises:
+            DiskError: there is no room for a copy; the file is as it was.
+        """
+        import h5py
+
+        temporary = self.path.with_name(self.path.name + ".tmp")
+        try:
+            shutil.copyfile(self.path, temporary)
+            changed = DiskFile(temporary)
+            changed.reserve(os.path.getsize(temporary) + len(self._parameters["scene"]) + (1 << 16))
+            with h5py.File(temporary, "r+", locking=False, libver=FORMAT) as file:
+                del file["parameters"]
+                add_parameters(file, self._parameters)
+            changed.sync()
+            os.replace(temporary, self.path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            if isinstance(error, DiskError):
+                error = error.__cause__ or error
+            raise DiskError.of(self.path, error) from None
+        finally:
+            disk.close()
+        return changed

@@ -1,7 +1,8 @@
-"""Reporters: what takes the frames of a run as they are made. `warpflag.recorder.Recorder` is one."""
+"""Reporters, which take the frames of a run as they are made; `warpflag.record.recorder.Recorder` is one."""
 
 from __future__ import annotations
 
+import functools
 import platform
 from collections.abc import Mapping
 from importlib import metadata
@@ -17,7 +18,7 @@ __all__ = ["Reporter", "start_reporter", "versions"]
 
 
 class Reporter(Protocol):
-    """Takes the frames of one run: `start`, `write` frame by frame, `close`, also after an error."""
+    """Takes the frames of one run: `start`, then `write` for every frame, then `close`, also after an error."""
 
     def start(
         self,
@@ -29,24 +30,35 @@ class Reporter(Protocol):
         body_width: float,
         versions: Mapping[str, str],
     ) -> None:
-        """Before the first frame.
+        """Called before the first frame.
 
-        scene_text: the scene as TOML. first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1.
-        filament_radius, body_length, body_width: [um]. versions: of the program and what it stands on.
+        Args:
+            scene_text: the scene as TOML.
+            first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+            filament_radius: of the flagella [um].
+            body_length: over the round ends [um].
+            body_width: of the body [um].
+            versions: of the program and the packages that it uses, by name.
         """
         ...
 
     def write(self, frame: Frame) -> None:
-        """Takes a frame; its arrays stay as they are."""
+        """Called for every frame; its arrays must not be changed."""
         ...
 
     def close(self) -> None:
-        """After the last frame."""
+        """Called after the last frame."""
         ...
 
 
 def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> None:
-    """Starts a reporter for a run of one scene."""
+    """Starts a reporter for a run of one scene.
+
+    Args:
+        reporter: the reporter.
+        scene: what is run.
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+    """
     reporter.start(
         dumps(scene),
         first_node,
@@ -58,6 +70,10 @@ def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> 
 
 
 def versions() -> dict[str, str]:
-    """Versions of this program, of Python and of the packages that it stands on, by name."""
-    packages = {name: metadata.version(name) for name in ("warp-lang", "numpy", "h5py", "usd-core")}
-    return {"warpflag": __version__, "python": platform.python_version(), **packages}
+    """Versions of this program, of Python and of the packages that it uses, by name."""
+    return {"warpflag": __version__, "python": platform.python_version(), **_package_versions()}
+
+
+@functools.cache
+def _package_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in ("warp-lang", "numpy", "h5py", "usd-core")}

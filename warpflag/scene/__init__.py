@@ -1,18 +1,9 @@
 """What a cell is: settings and their sections, the scene and its file, resistance coefficients."""
 
-from warpflag.scene.scene import (
-    Body,
-    Flagella,
-    FlagellumOverride,
-    FlagellumSpec,
-    Motor,
-    Scene,
-    SceneError,
-    dumps,
-    load,
-    loads,
-    with_values,
-)
+from warpflag.scene.errors import SceneError
+from warpflag.scene.reading import dumps, load, loads, with_values
+from warpflag.scene.scene import FlagellumSpec, Scene
+from warpflag.scene.sections import Body, Flagella, FlagellumOverride, Motor
 
 __all__ = [
     "Body",

@@ -1,7 +1,7 @@
-"""Drag and hydrodynamic coefficients of a scene: plain numbers that the device model is filled with.
+"""Drag and hydrodynamic coefficients of a scene, as plain numbers for the device model.
 
-Local drag per unit length is the paper's (gamma_par, gamma_perp, gamma_R). A node carries the drag of h, the free end
-of h/2. The body moves by the mobility of a prolate spheroid of its aspect ratio (Kim & Karrila, Microhydrodynamics).
+Local drag per unit length is the paper's (gamma_par, gamma_perp, gamma_R). A node has the drag of a length h, the free
+end that of h/2. The body moves by the mobility of a prolate spheroid of its aspect ratio.
 """
 
 from __future__ import annotations
@@ -21,8 +21,14 @@ _ZETA_3 = 1.2020569031595942
 
 @dataclass(frozen=True)
 class SpheroidMobility:
-    """Mobility of the body: translation along and across the axis [um/(s pN)], rotation about and across it
-    [1/(pN um s)]."""
+    """Mobility of the body.
+
+    Attributes:
+        along: translation along the axis [um/(s pN)].
+        across: translation across it [um/(s pN)].
+        spin: rotation about the axis [1/(pN um s)].
+        tumble: rotation about an axis across it [1/(pN um s)].
+    """
 
     along: float
     across: float
@@ -32,8 +38,13 @@ class SpheroidMobility:
 
 @dataclass(frozen=True)
 class FilamentMobility:
-    """Mobility of a node that carries one segment length: along and across the tangent [um/(s pN)], and of a
-    segment's spin [1/(pN um s)]."""
+    """Mobility of a node that has the drag of one segment length.
+
+    Attributes:
+        along: translation along the tangent [um/(s pN)].
+        across: translation across it [um/(s pN)].
+        spin: rotation of a segment about its tangent [1/(pN um s)].
+    """
 
     along: float
     across: float
@@ -41,11 +52,15 @@ class FilamentMobility:
 
 
 def spheroid_mobility(length: float, width: float, viscosity: float) -> SpheroidMobility:
-    """Mobility of a prolate spheroid (Kim & Karrila, table 3.4); a sphere where length equals width.
+    """Mobility of a prolate spheroid; a sphere where length equals width.
 
     Args:
-        length, width: axes of the spheroid, length >= width [um].
+        length: of the long axis [um].
+        width: of the short axes, not above the length [um].
         viscosity: of the fluid [pN s/um^2].
+
+    Source:
+        Kim & Karrila, Microhydrodynamics, table 3.4.
     """
     a = length / 2
     e2 = 1.0 - (width / length) ** 2
@@ -68,6 +83,9 @@ def pair_radius(scene: Scene) -> float:
     As printed (the filament radius), a node's local mobility 1/(gamma_perp h) is below that of a bead of radius a
     once h > 6 pi eta a/gamma_perp, and the mobility of two nodes in contact has a negative eigenvalue: they attract
     where they should repel. With a = max(filament radius, gamma_perp h/(6 pi eta)) it is positive definite.
+
+    Raises:
+        SceneError: in mode consistent, segments too short for any radius.
     """
     h = max(spec.segment_length for spec in scene.resolved_flagella())
     radius, eta = scene.flagella.filament_radius, scene.fluid.viscosity
@@ -81,10 +99,17 @@ def pair_radius(scene: Scene) -> float:
 
 
 def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
-    """Local mobility of a node and of a segment's spin for segments of one length [um].
+    """Local mobility of a node and of a segment's spin.
 
-    In mode "consistent" the local drag is what is left of slender-body theory once the pair sum carries the flow from
+    In mode "consistent" the local drag is what slender-body theory leaves once the pair sum contains the flow from
     distances of h and more, so that nothing counts twice and the sum of both converges with h.
+
+    Args:
+        scene: gives drag, viscosity and hydrodynamics mode.
+        segment_length: h [um].
+
+    Raises:
+        SceneError: in mode consistent, segments too short for any pair radius.
     """
     parallel, perpendicular, rotation = _drag(scene)
     h = segment_length
@@ -105,11 +130,19 @@ def _drag(scene: Scene) -> tuple[float, float, float]:
 
 
 def _slender_body(h: float, radius: float, a_pair: float) -> tuple[float, float]:
-    """Local mobility along and across a filament in units of 1/(4 pi eta h), Lighthill's theorem less the pair sum.
+    """Local mobility along and across a filament in units of 1/(4 pi eta h): Lighthill's theorem less the pair sum.
 
-    Lighthill (SIAM Rev. 18, 161 (1976)): u = f_n/(4 pi eta) + the flow of Stokeslets beyond delta = a sqrt(e)/2. On a
-    straight filament the pair sum over nodes n h gives the logarithm of that integral up to ln(h/delta) - 0.5772 per
-    side, and its a_pair^2/r^2 terms add up to zeta(3): both are corrected here.
+    The theorem: u = f_n/(4 pi eta) + the flow of Stokeslets beyond delta = a sqrt(e)/2. On a straight filament the
+    pair sum over nodes n h gives the logarithm of that integral up to ln(h/delta) - 0.5772 per side, and its
+    a_pair^2/r^2 terms add up to zeta(3): both are corrected here.
+
+    Args:
+        h: segment length [um].
+        radius: of the filament, a [um].
+        a_pair: radius of the pair term [um].
+
+    Source:
+        Lighthill, SIAM Rev. 18, 161 (1976).
     """
     delta = radius * math.sqrt(math.e) / 2
     log = math.log(h / delta) - np.euler_gamma

@@ -1,20 +1,55 @@
-"""Scene files and ``--set`` arguments as plain values by dotted key; sections as TOML text."""
+"""Scene files and `--set` arguments as plain values by dotted key; sections as TOML text."""
 
 from __future__ import annotations
 
 import difflib
+import os
+import re
+import stat
 import tomllib
 from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from warpflag.scene.settings import SceneError, Section, shown, written
+from warpflag.scene.errors import SceneError, shown, written
+from warpflag.scene.settings import Section
+
+__all__ = ["flattened", "nearest", "parsed", "read_overrides", "read_toml", "section_lines"]
+
+# Beyond any sensible scene, and below what the parser of TOML takes much time or memory for. Ten thousand flagella
+# with every key of their own, as `dumps` writes them, are 3 MB.
+_MOST_BYTES = 4 * 2**20
+_DEEPEST = 16  # levels of arrays, inline tables and dotted keys
+_MOST_DIGITS = 1000
+
+# Strings, also those without an end, and comments: what looks like brackets or dots there is none.
+_STRING = re.compile(
+    r'''"""(?:[^"\\]|\\.|"(?!""))*+(?:"""|\Z)|\'{3}(?:[^']|'(?!''))*+(?:\'{3}|\Z)|'''
+    r""""(?:[^"\\\n]|\\[^\n])*+"?|'[^'\n]*+'?|\#[^\n]*+""",
+    re.DOTALL,
+)
+_BRACKET = re.compile(r"[\[\]{}]")
+_LONG_DOTTED_KEY = re.compile(rf"(?<![\w-])[\w-]++(?:[ \t]*+\.[ \t]*+[\w-]++){{{_DEEPEST}}}")
+_LONG_NUMBER = re.compile(rf"(?<!\w)(?:0[xob])?[\da-fA-F_]{{{_MOST_DIGITS}}}")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file; SceneError when it can't be read."""
+    """The tables of a TOML file.
+
+    Raises:
+        SceneError: it can't be read, is no regular file, is too large, or is not TOML; it names the file.
+    """
     try:
-        return parsed(path.read_text(encoding="utf-8"))
+        mode = path.stat().st_mode  # before it is opened: a pipe would wait for its writer
+        if stat.S_ISDIR(mode):
+            problem = "can't be read: it is a directory"
+        elif not stat.S_ISREG(mode):
+            problem = "can't be read: it is not a regular file"
+        else:
+            with path.open("rb") as file:
+                content = file.read(_MOST_BYTES + 1)
+            _refuse_size(len(content))
+            return parsed(content.decode("utf-8-sig"))
     except SceneError as error:
         raise error.located(path) from None
     except FileNotFoundError:
@@ -22,39 +57,88 @@ def read_toml(path: Path) -> dict[str, Any]:
     except UnicodeDecodeError:
         problem = "is not a text file in UTF-8"
     except OSError as error:
-        problem = f"can't be read: {error.strerror}"
+        problem = f"can't be read: {os.strerror(error.errno) if error.errno else error}"
+    except ValueError:  # of a path with a zero byte
+        problem = "no such file"
     raise SceneError(None, None, problem, source=str(path))
 
 
 def parsed(toml: str) -> dict[str, Any]:
-    """The tables of a TOML text; SceneError when it is none."""
+    """The tables of a TOML text.
+
+    Raises:
+        SceneError: it is too large or nested too deeply, or no TOML.
+    """
+    _refuse_extremes(toml)
     try:
         return tomllib.loads(toml)
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(None, None, f"is not valid TOML: {error}") from None
+    except (ValueError, RecursionError) as error:  # of TOML, and of numbers and dates beyond Python's
+        raise SceneError(None, None, f"is not valid TOML: {' '.join(str(error).split())[:200]}") from None
+
+
+def _refuse_size(size: int) -> None:
+    if size > _MOST_BYTES:
+        raise SceneError(None, None, f"is larger than {_MOST_BYTES // 2**20} MiB, which no scene needs")
+
+
+def _refuse_extremes(toml: str) -> None:
+    """Refuses what the parser would take minutes, gigabytes or Python's whole stack for."""
+    _refuse_size(len(toml))
+    bare = _STRING.sub("s", toml)
+    depth = 0
+    for bracket in _BRACKET.finditer(bare):
+        depth = depth + 1 if bracket[0] in "[{" else max(depth - 1, 0)
+        if depth > _DEEPEST:
+            raise SceneError(None, None, f"has arrays or tables nested more than {_DEEPEST} deep")
+    if _LONG_DOTTED_KEY.search(bare):
+        raise SceneError(None, None, f"has a dotted key of more than {_DEEPEST} parts")
+    if _LONG_NUMBER.search(bare):
+        raise SceneError(None, None, f"has a number or key of {_MOST_DIGITS} digits or more")
 
 
 def flattened(table: Mapping[str, Any], sections: Container[str]) -> tuple[dict[str, Any], int]:
-    """Values by dotted key, and the number of [[flagellum]] tables (one of them may be empty)."""
+    """The tables of a scene file as values by dotted key.
+
+    Args:
+        table: tables as TOML nests them.
+        sections: names of tables that may be empty.
+
+    Returns:
+        The values, and the number of [[flagellum]] tables.
+
+    Raises:
+        SceneError: a key is given twice, as with "motor.torque" in quotes beside [motor].
+    """
     values: dict[str, Any] = {}
     tables = 0
+
+    def add(key: str, value: Any) -> None:
+        if key in values:
+            raise SceneError(key, value, f"is given twice; the other value is {shown(values[key])}")
+        values[key] = value
+
     for key, value in table.items():
         if key == "flagellum" and isinstance(value, list) and all(isinstance(own, dict) for own in value):
             tables = len(value)
             for k, own in enumerate(value):
-                values |= {f"flagellum.{k}.{name}": item for name, item in own.items()}
+                for name, item in own.items():
+                    add(f"flagellum.{k}.{name}", item)
         elif isinstance(value, dict) and (value or key in sections) and key != "flagellum":
-            values |= {f"{key}.{name}": item for name, item in value.items()}
+            for name, item in value.items():
+                add(f"{key}.{name}", item)
         else:
-            values[key] = value
+            add(key, value)
     return values, tables
 
 
 def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, Any]:
-    """Values by dotted key from ``--set`` arguments (``key=value``) or from a mapping.
+    """Values by dotted key from `--set` arguments (key=value) or from a mapping; of two for one key the last counts.
 
-    A text is read as a TOML value; where it is none it stands for itself, so that ``mode=none`` and
-    ``record=runs/zipping`` need no quotes.
+    A text is read as a TOML value; where it is none it stands for itself, so that mode=none and
+    record=runs/zipping need no quotes.
+
+    Raises:
+        SceneError: an argument has no key or no equals sign.
     """
     if isinstance(overrides, Mapping):
         pairs = list(overrides.items())
@@ -71,8 +155,8 @@ def read_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> dict[str, An
 
 def _typed(value: str) -> Any:
     try:
-        table = tomllib.loads(f"value = {value}")
-    except tomllib.TOMLDecodeError:
+        table = parsed(f"value = {value}")
+    except SceneError:
         return value
     # A value with a line break could define further keys.
     return table["value"] if len(table) == 1 else value
@@ -89,7 +173,9 @@ def section_lines(section: Section) -> list[str]:
 
 
 def nearest(key: str, known: Iterable[str]) -> str | None:
-    """The known dotted key that ``key`` was probably meant to be."""
+    """The known dotted key that `key` was probably meant to be; None where none is near."""
+    if len(key) > 200:
+        return None
     known = list(known)
     leaf = key.rpartition(".")[2]
     same_leaf = [other for other in known if other.rpartition(".")[2] == leaf]

@@ -1,4 +1,4 @@
-"""The sections of a scene: one frozen dataclass each, one declaration per setting.
+"""The sections of a scene: a frozen dataclass for each, with a declaration for every setting.
 
 Units are um, pN and s throughout (so pN um for torques, pN s/um^2 for viscosity); angles are in degrees.
 Defaults are those of Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015), "the paper", wherever it prints a
@@ -40,7 +40,7 @@ class Flagella(Section, key="flagella"):
         derived="all flagella start at the same phase angle",
     )
     anchor_offset: float = number(
-        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", smallest=1e-4
+        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", usual=(1e-3, 5.0)
     )
     bending_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "A, the paper's")
     twist_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "C, in the paper equal to A")
@@ -62,11 +62,11 @@ class Flagella(Section, key="flagella"):
 
 @dataclass(frozen=True)
 class FlagellumOverride(Section, key="flagellum"):
-    """What one flagellum has of its own: a [[flagellum]] table. Absent fields are the group's."""
+    """Values of a single flagellum, a [[flagellum]] table; what is absent is taken from the group."""
 
     azimuth: float | None = number(None, "deg", -360, 360, "of the anchor about e_b3, from e_b1", derived="360 k/count")
     anchor_offset: float | None = number(
-        None, "um", -50, 50, "as flagella.anchor_offset", smallest=1e-4, derived="flagella.anchor_offset"
+        None, "um", -50, 50, "as flagella.anchor_offset", usual=(1e-3, 5.0), derived="flagella.anchor_offset"
     )
     motor_axis_angle: float | None = number(
         None, "deg", 0, 180, "motor axis to e_b3, toward the outward normal", derived="motor.axis_angle"
@@ -74,7 +74,7 @@ class FlagellumOverride(Section, key="flagellum"):
     tilt: float | None = number(
         None, "deg", 0, 180, "helix axis to e_b3, toward the normal", derived="flagella.opening_angle / 2"
     )
-    torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", smallest=1e-6, derived="motor.torque")
+    torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", usual=(1e-3, 1e3), derived="motor.torque")
     length: float | None = number(None, "um", 0.1, 100, "contour length", derived="flagella.length")
     segments: int | None = integer(
         None, 2, 10_000, "number of segments", derived="length / flagella.segment_length, rounded"
@@ -98,7 +98,7 @@ class Motor(Section, key="motor"):
     """
 
     torque: float = number(
-        3.4, "pN um", -1e3, 1e3, "on each flagellum about the motor axis; negative: reversed", smallest=1e-6
+        3.4, "pN um", -1e3, 1e3, "on each flagellum about the motor axis; negative: reversed", usual=(1e-3, 1e3)
     )
     axis_angle: float = number(55.0, "deg", 0, 180, "motor axis to e_b3, toward the outward normal")
     bearing_torque: bool = switch(
@@ -126,7 +126,7 @@ class Fluid(Section, key="fluid"):
 
 @dataclass(frozen=True)
 class Hydrodynamics(Section, key="hydrodynamics"):
-    """Which flows of one node are felt by another.
+    """Which nodes move in the flow of which other nodes.
 
     none: local drag only. within: nodes of the same flagellum. between: nodes of different flagella.
     all: both, the paper's sum, with a radius that keeps it positive definite. as_printed: the paper's sum
@@ -161,9 +161,9 @@ class Steric(Section, key="steric"):
 
 @dataclass(frozen=True)
 class Body(Section, key="body"):
-    """The cell body: a spherocylinder to the flagella, a prolate spheroid to the fluid. Sizes: the paper.
+    """The cell body: a spherocylinder in contact, a prolate spheroid in the fluid. Sizes are the paper's.
 
-    The three motions are the paper's ablations; anchored takes all of them.
+    Switching its motions off one by one gives the paper's ablations; anchored switches all of them off.
     """
 
     length: float = number(2.5, "um", 0.1, 100, "L_b, caps included")
@@ -176,7 +176,7 @@ class Body(Section, key="body"):
 
 @dataclass(frozen=True)
 class External(Section, key="external"):
-    """Forces from outside, in lab axes: sedimentation, the pull of a laser trap."""
+    """External forces in lab axes: sedimentation, the pull of a laser trap."""
 
     force_per_length: tuple[float, float, float] = vector(
         (0.0, 0.0, 0.0), "pN/um", -1e3, 1e3, "uniform force per contour length on every flagellum"
@@ -188,7 +188,7 @@ class External(Section, key="external"):
 
 @dataclass(frozen=True)
 class Numerics(Section, key="numerics"):
-    """How time is stepped. Nothing here is physics."""
+    """How time is stepped: numerical method, step and precision."""
 
     stepper: str = choice(
         "implicit",
@@ -223,8 +223,7 @@ class Numerics(Section, key="numerics"):
 class Start(Section, key="start"):
     """Where the run starts: from the scene's own shape, or from a frame of a record.
 
-    A record brings the flagella's shape, their phases and the body's pose; phases that the scene gives are
-    then unused.
+    A record gives the shape of the flagella, their phases and the body's pose; phases of the scene are then unused.
     """
 
     record: str | None = text(

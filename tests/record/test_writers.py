@@ -1,0 +1,187 @@
+"""Writers that are watched, killed, interrupted and resumed: what was committed is there, and goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import h5py  # noqa: TID253 (no command line starts here)
+import numpy as np
+import pytest
+
+from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
+from warpflag.record import Record, RecordError
+from warpflag.record.recorder import Recorder
+
+WRITER = """
+import sys
+sys.path[:0] = {paths!r}
+from pathlib import Path
+from tests.record.frames import frame, started
+recorder = started(Path({path!r}))
+index = 0
+while True:
+    recorder.write(frame(index))
+    index += 1
+    if index % 10 == 1:
+        recorder.flush()
+        print(recorder.frame_count, flush=True)
+        if {wait!r}:
+            sys.stdin.readline()
+"""
+
+
+def start_writer(path: Path, *, wait: bool) -> subprocess.Popen:
+    """A process that writes frames without end and says after every flush how many it has committed."""
+    script = WRITER.format(paths=[str(Path(__file__).parents[2])], path=str(path), wait=wait)
+    return subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def test_another_process_reads_while_a_run_writes(tmp_path):
+    with start_writer(tmp_path / "run.h5", wait=True) as process:
+        assert process.stdin is not None and process.stdout is not None
+        for committed in (1, 11, 21):
+            assert int(process.stdout.readline()) == committed
+            with Record(tmp_path) as record:
+                assert_holds_frames(record, range(committed))
+            process.stdin.write("on\n")
+            process.stdin.flush()
+        process.kill()
+
+
+def test_a_record_opens_at_any_moment_of_a_run_that_writes_without_pause(tmp_path):
+    path = tmp_path / "run.h5"
+    with start_writer(path, wait=False) as process, ThreadPoolExecutor(1) as pool:
+        assert process.stdout is not None
+        process.stdout.readline()
+        said = pool.submit(process.stdout.read)  # or the writer would wait for its reader
+        counts = []
+        for _ in range(60):
+            with Record(path) as record:
+                counts.append(record.frame_count)
+        process.kill()
+        said.result()
+    assert counts == sorted(counts) and counts[-1] > counts[0]
+
+
+@pytest.mark.parametrize("blocks", [1, 2, 7, 40, 90])
+def test_a_killed_writer_leaves_every_committed_frame(tmp_path, blocks):
+    path = tmp_path / "run.h5"
+    process = start_writer(path, wait=False)
+    try:
+        assert process.stdout is not None
+        for _ in range(blocks):
+            promised = int(process.stdout.readline())
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        said_after = process.communicate()[0].splitlines()
+    promised = int(said_after[-1]) if said_after else promised
+    with Record(path) as record:
+        assert record.frame_count >= promised >= 10 * blocks - 9
+        assert_holds_frames(record, range(record.frame_count))
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_an_interrupted_commit_is_repeated(tmp_path, monkeypatch):
+    recorder = started(tmp_path / "run.h5")
+    for index in range(10):
+        recorder.write(frame(index))
+    flush, calls = h5py.File.flush, []
+
+    def interrupted(file):
+        flush(file)
+        calls.append(file)
+        raise KeyboardInterrupt
+
+    for at in (10, 11):  # between the values and the marker, twice
+        monkeypatch.setattr(h5py.File, "flush", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            recorder.write(frame(at))
+            recorder.flush()
+        monkeypatch.setattr(h5py.File, "flush", flush)
+        assert Record(tmp_path).frame_count == 1
+    assert len(calls) == 2
+    recorder.close()
+    with Record(tmp_path) as record:
+        assert_holds_frames(record, range(12))
+
+
+def test_resume_cuts_at_the_step_and_appends(tmp_path):
+    path = written(tmp_path / "run.h5", 25)
+    recorder = Recorder(path, resume_step=105)  # between the steps of frames 10 and 11
+    recorder.start("longer", FIRST_NODE, filament_radius=0.01, body_length=2.5, body_width=0.8)
+    assert recorder.frame_count == 11
+    with Record(path) as record:
+        assert_holds_frames(record, range(11))
+    for index in range(11, 30):
+        recorder.write(frame(index))
+    recorder.close()
+    with Record(path) as record:
+        assert_holds_frames(record, range(30))
+        assert record.scene_text == "longer"
+        assert record.scene_sha256 == hashlib.sha256(b"longer").hexdigest()
+
+
+def test_resume_keeps_the_frame_of_its_step(tmp_path):
+    path = written(tmp_path / "run.h5", 25)
+    started(path, resume_step=100).close()
+    with Record(path) as record:
+        assert_holds_frames(record, range(11))
+
+
+def test_resume_takes_observables_in_any_order(tmp_path):
+    path = written(tmp_path / "run.h5", 25)
+    recorder = started(path, resume_step=100)
+    for index in range(11, 25):
+        own = frame(index)
+        recorder.write(dataclasses.replace(own, observables=dict(reversed(own.observables.items()))))
+    recorder.close()
+    with Record(path) as record:
+        assert_holds_frames(record, range(25))
+
+
+def test_resume_needs_a_record_of_the_same_flagella(tmp_path):
+    with pytest.raises(RecordError, match="no such record"):
+        started(tmp_path / "run.h5", resume_step=0)
+    path = written(tmp_path / "run.h5", 3)
+    other = Recorder(path, resume_step=0)
+    with pytest.raises(RecordError, match="other flagella"):
+        other.start(SCENE, np.array([0, 5, 9]), filament_radius=0.01, body_length=2.5, body_width=0.8)
+    with Record(path) as record:
+        assert_holds_frames(record, range(3))
+
+
+def test_a_record_that_is_closed_between_blocks(tmp_path):
+    """So many can be written that they can't all be open; only full blocks and flushes are committed."""
+    now, files = [0.0], len(os.listdir("/dev/fd"))
+    recorders = [started(tmp_path / f"{k}.h5", block_frames=4, keep_open=False, clock=lambda: now[0]) for k in range(9)]
+    for recorder in recorders:
+        recorder.write(frame(0))
+    first, second = recorders[:2]
+    for index in range(1, 7):
+        now[0] += 100.0
+        first.write(frame(index))
+    assert len(os.listdir("/dev/fd")) == files
+    with Record(first.path) as record:
+        assert_holds_frames(record, range(5))
+    first.flush()
+    first.flush()
+    with Record(first.path) as record:
+        assert_holds_frames(record, range(7))
+    started(first.path, resume_step=10**9).close()  # it is not locked
+    for recorder in recorders:
+        recorder.close()
+    with pytest.raises(RecordError, match="exists already"):
+        first.write(frame(7))
+    resumed = started(second.path, resume_step=0, block_frames=4, keep_open=False)
+    for index in range(1, 6):
+        resumed.write(frame(index))
+    resumed.close()
+    with Record(second.path) as record:
+        assert_holds_frames(record, range(6))

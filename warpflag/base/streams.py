@@ -1,0 +1,95 @@
+"""Messages to standard error or another text stream that may be closed, full, or read by nobody."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO
+
+__all__ = ["is_terminal", "protected_streams", "say"]
+
+
+def say(text: str, stream: TextIO | None = None) -> bool:
+    """Writes a text and flushes it; a stream that can't take it never stops the program.
+
+    Args:
+        text: what is written as it is; characters that the stream can't encode are escaped.
+        stream: where to; default: standard error, which is None in a process started without one.
+
+    Returns:
+        Whether it was written. After False the stream is better left alone.
+    """
+    stream = sys.stderr if stream is None else stream
+    if stream is None:
+        return False
+    try:
+        encoding = getattr(stream, "encoding", None) or "utf-8"
+        stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        stream.flush()
+    except (OSError, ValueError):  # full, or without a reader; closed
+        return False
+    return True
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a stream is a terminal; not if it is closed or absent."""
+    try:
+        return stream is not None and stream.isatty()
+    except (OSError, ValueError):
+        return False
+
+
+@contextlib.contextmanager
+def protected_streams() -> Iterator[None]:
+    """While it lasts, what is printed never stops the program; around or, as a decorator, on a whole command.
+
+    Standard streams that are closed are opened on the null device, so that no file of the program takes their place.
+    One that is full or has lost its reader goes to the null device from then on.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, this one
+    kept = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _Protected(sys.stdout, 1), _Protected(sys.stderr, 2)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stdout, sys.stderr = kept
+
+
+class _Protected:
+    """A text stream whose write and flush never raise for want of a reader, of room, or of a character."""
+
+    def __init__(self, stream: TextIO | None, descriptor: int) -> None:
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115 (lasts as long as this does)
+        self._descriptor = descriptor
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        try:
+            encoding = getattr(self._stream, "encoding", None) or "utf-8"
+            return self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        except (OSError, ValueError):
+            self._let_go()
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except (OSError, ValueError):
+            self._let_go()
+
+    def _let_go(self) -> None:
+        """Points the descriptor to the null device, where what the stream still holds can go."""
+        with contextlib.suppress(OSError, ValueError):
+            if self._stream.fileno() == self._descriptor:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, self._descriptor)
+                os.close(nowhere)

@@ -1,0 +1,85 @@
+"""Frames of one quantity of a record, read as they are indexed and compared with their checksums."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warpflag.record.layout import RecordError, checksum, one_line
+
+__all__ = ["FrameArray", "reading"]
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turns whatever HDF5 and h5py raise over a damaged file, which are errors of many kinds, into a RecordError.
+
+    Args:
+        path: the file.
+        what: what is wrong with it, for the message.
+    """
+    try:
+        yield
+    except RecordError:
+        raise
+    except Exception as error:
+        raise RecordError(f"{path}: {what}: {one_line(error)}") from error
+
+
+class FrameArray:
+    """Frames of one quantity, read as they are indexed: a[i], a[10:20, :3], or np.asarray(a) for all.
+
+    Every frame that is read is compared with its checksum; where they differ, or the file can't be read, indexing
+    raises RecordError.
+
+    Args:
+        dataset: of HDF5, frames first.
+        sums: checksums of the committed frames, shape [frame_count]; None for a record without.
+        frame_count: number of committed frames; what the dataset holds beyond is left out.
+        path: the file, for messages.
+        name: of the quantity, for messages.
+
+    Attributes:
+        shape: [frame_count, ...].
+    """
+
+    def __init__(self, dataset: Any, sums: NDArray[np.uint32] | None, frame_count: int, path: Path, name: str):
+        self._dataset = dataset
+        self._sums = sums
+        self._path = path
+        self._name = name
+        self.shape: tuple[int, ...] = (frame_count, *dataset.shape[1:])
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> NDArray[np.float64]:
+        first, *rest = key if isinstance(key, tuple) else (key,)
+        if first is Ellipsis:
+            first, rest = slice(None), [Ellipsis, *rest]
+        rows = np.arange(len(self))[first]  # IndexError and negative steps as in any array
+        if rows.size == 0:
+            return np.empty(self.shape)[key]
+        low = int(rows.min())
+        with reading(self._path, "frames can't be read"):
+            block = np.asarray(self._dataset[low : int(rows.max()) + 1])
+            if len(block) != int(rows.max()) + 1 - low:
+                raise RecordError(f"{self._path}: is damaged: /{self._name} ends before frame {int(rows.max())}")
+        self._verify(block, low)
+        return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype=dtype)
+
+    def _verify(self, block: NDArray[Any], low: int) -> None:
+        if self._sums is None:
+            return
+        for index, (row, expected) in enumerate(zip(block, self._sums[low:], strict=False), low):
+            if checksum(row) != expected:
+                problem = f"frame {index} of /{self._name} does not agree with its checksum"
+                raise RecordError(f"{self._path}: is damaged: {problem}")

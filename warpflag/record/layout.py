@@ -1,0 +1,132 @@
+"""Layout of the record of a run, run.h5 (H5MD 1.1), and one frame of it.
+
+Units um, pN, s, rad. Every entry but the parameters and checksums is a group of value, step and time, frames first:
+
+    /particles/flagella/position   [frame, node, 3]: lab axes [um], flagellum after flagellum, r_0 to r_N each
+    /particles/flagella/e1         [frame, node, 3]: director e1 of motor tripod and segments, same order
+    /cell/motor_angle              [frame, flagellum]: tripod about m relative to the body, accumulated [rad]
+    /cell/body_position            [frame, 3]: centre of the body [um]
+    /cell/body_orientation         [frame, 4]: quaternion (x, y, z, w) from body to lab axes
+    /observables/NAME              [frame] or [frame, flagellum]
+    /checksums                     [frame, entry]: CRC-32 of each frame's values; attribute entries: which, in order
+    /parameters/scene, scene_sha256                          the scene text and its hash
+    /parameters/first_node                                   [flagellum_count + 1]: flagellum k has the nodes
+                                                             first_node[k] to first_node[k + 1] - 1
+    /parameters/filament_radius, body_length, body_width     [um]
+    /parameters/versions                                     attributes by name
+    /parameters                                              attribute checksum: CRC-32 of all of the above
+
+/cell and /parameters stay out of /particles, where readers of H5MD expect one group with per-node entries.
+All entries share one step and one time dataset (hard links). `step` is written last: its length is the number
+of committed frames, and everything else is cut to it.
+
+Checksums are kept by frame rather than by HDF5's filter by chunk, because a chunk is written again with every block of
+frames that goes into it: a process killed in the middle would leave frames that were good before with a wrong checksum.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "BODY_ORIENTATION",
+    "BODY_POSITION",
+    "CHECKSUMS",
+    "E1",
+    "ENTRIES",
+    "MOTOR_ANGLE",
+    "PARAMETERS",
+    "POSITION",
+    "RECORD_NAME",
+    "Frame",
+    "RecordError",
+    "checksum",
+    "dataset_path",
+    "one_line",
+    "parameters_checksum",
+    "summed_entries",
+    "text_of",
+]
+
+RECORD_NAME = "run.h5"
+POSITION = "particles/flagella/position"
+E1 = "particles/flagella/e1"
+MOTOR_ANGLE = "cell/motor_angle"
+BODY_POSITION = "cell/body_position"
+BODY_ORIENTATION = "cell/body_orientation"
+ENTRIES = (POSITION, E1, MOTOR_ANGLE, BODY_POSITION, BODY_ORIENTATION)
+CHECKSUMS = "checksums"
+PARAMETERS = ("scene", "scene_sha256", "first_node", "filament_radius", "body_length", "body_width")
+
+
+class RecordError(ValueError):
+    """A record that can't be read or continued; the message is one line that names the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame of a run, in lab coordinates.
+
+    Attributes:
+        time: simulated time [s].
+        step: number of steps taken when the frame was made.
+        positions: nodes [um], shape [node_count, 3], flagellum after flagellum.
+        directors: e1 of tripod and segments, shape [node_count, 3].
+        motor_angle: of each tripod about its axis m relative to the body, accumulated [rad], shape [flagellum_count].
+        body_position: centre of the body [um], shape [3].
+        body_orientation: quaternion (x, y, z, w) from body to lab axes, shape [4].
+        observables: by name, a number or an array of shape [flagellum_count] each.
+    """
+
+    time: float
+    step: int
+    positions: NDArray[np.floating]
+    directors: NDArray[np.floating]
+    motor_angle: NDArray[np.floating]
+    body_position: NDArray[np.floating]
+    body_orientation: NDArray[np.floating]
+    observables: dict[str, float | NDArray[np.floating]] = field(default_factory=dict)
+
+
+def dataset_path(name: str) -> str:
+    """Where the values of an entry lie; step and time are the datasets that all entries share."""
+    if name in ("step", "time"):
+        return f"{POSITION}/{name}"
+    return name if name == CHECKSUMS else f"{name}/value"
+
+
+def checksum(values: ArrayLike) -> int:
+    """CRC-32 of one frame's values of one entry, taken of their bytes as little-endian 8-byte numbers."""
+    values = np.asarray(values)
+    kind = "<i8" if values.dtype.kind in "iu" else "<f8"
+    return zlib.crc32(np.ascontiguousarray(values, dtype=kind).tobytes())
+
+
+def parameters_checksum(parameters: Mapping[str, Any]) -> int:
+    """CRC-32 of what /parameters holds; `parameters` has the keys PARAMETERS and versions."""
+    plain = {name: np.asarray(parameters[name]).tolist() for name in PARAMETERS}
+    plain["versions"] = {str(name): str(value) for name, value in parameters["versions"].items()}
+    return zlib.crc32(json.dumps(plain, sort_keys=True).encode())
+
+
+def summed_entries(checksums: Any) -> list[str]:
+    """The entries whose checksums the columns of the dataset /checksums hold."""
+    return [text_of(name) for name in checksums.attrs["entries"]]
+
+
+def text_of(value: Any) -> str:
+    """A text from HDF5, where it is bytes or, in attributes of variable length, a text already."""
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error of HDF5 on one line of at most 300 characters."""
+    line = " ".join(str(error).split())
+    return line if len(line) <= 300 else line[:297] + "..."

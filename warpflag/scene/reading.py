@@ -1,0 +1,175 @@
+"""Scenes made of files, of TOML texts and of other scenes, and scenes written as TOML."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from warpflag.scene import scene_file
+from warpflag.scene.errors import Problems, SceneError, written
+from warpflag.scene.scene import Scene
+from warpflag.scene.sections import (
+    Body,
+    External,
+    Flagella,
+    FlagellumOverride,
+    Fluid,
+    Hydrodynamics,
+    Motor,
+    Numerics,
+    Start,
+    Steric,
+)
+from warpflag.scene.settings import Section, Setting
+
+__all__ = ["dumps", "load", "loads", "with_values"]
+
+_SECTIONS: dict[str, type[Section]] = {
+    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
+}
+_KEYS: dict[str, Setting] = {
+    f"{cls.key}.{name}".lstrip("."): setting
+    for cls in (Scene, *_SECTIONS.values(), FlagellumOverride)
+    for name, setting in cls.settings.items()
+}
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) -> Scene:
+    """Reads a scene file. A file without a name gets its own file name.
+
+    Args:
+        path: the file.
+        overrides: values that replace the file's, as texts key=value or as a mapping from dotted key to value;
+            flagellum k (from 0) has keys `flagellum.k.torque` and so on.
+
+    Raises:
+        SceneError: the scene can't be simulated; it names the file and the keys.
+    """
+    given = scene_file.read_overrides(overrides)
+    try:
+        values, tables = scene_file.flattened(scene_file.read_toml(Path(path)), _SECTIONS)
+    except SceneError as error:
+        raise (error if error.source else error.located(path)) from None
+    values.setdefault("name", re.sub(r"[^\w.+-]+", "-", Path(path).stem).strip("-.+") or "scene")
+    try:
+        return _built({**values, **given}, tables)
+    except SceneError as error:
+        raise error.located(path, given) from None
+
+
+def loads(toml: str) -> Scene:
+    """The scene of a TOML text, as `dumps` writes it.
+
+    Raises:
+        SceneError: the scene can't be simulated.
+    """
+    return _built(*scene_file.flattened(scene_file.parsed(toml), _SECTIONS))
+
+
+def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
+    """A checked copy with other values.
+
+    Args:
+        scene: the original, which stays as it is.
+        values: by dotted key, `{"motor.torque": 2.0}`; None makes a value absent.
+
+    Raises:
+        SceneError: the copy can't be simulated.
+    """
+    parts = {"": scene, **{key: getattr(scene, key) for key in _SECTIONS}}
+    parts |= {f"flagellum.{k}": own for k, own in enumerate(scene.flagellum)}
+    flat = {f"{key}.{name}".lstrip("."): getattr(part, name) for key, part in parts.items() for name in part.settings}
+    return _built({**flat, **values}, len(scene.flagellum))
+
+
+def dumps(scene: Scene) -> str:
+    """The scene as TOML text, every default written out; a scene read from it is equal."""
+    lines = [
+        "# A warpflag scene. Units: um, pN, s (torque pN um, rigidity pN um^2, viscosity pN s/um^2);",
+        "# angles in degrees. A commented key is absent; its comment says what is taken instead.",
+        "",
+        *scene_file.section_lines(scene),
+    ]
+    for key in _SECTIONS:
+        lines += ["", f"[{key}]", *scene_file.section_lines(getattr(scene, key))]
+    for k, own in enumerate(scene.flagellum):
+        values = {name: getattr(own, name) for name in own.settings}
+        lines += ["", f"[[flagellum]] # flagellum {k}; absent keys are the group's"]
+        lines += [f"{name} = {written(value)}" for name, value in values.items() if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+def _built(values: Mapping[str, Any], tables: int) -> Scene:
+    """A scene of values by dotted key, of which `tables` overrides of flagella exist already."""
+    problems = Problems()
+    own: dict[int, dict[str, Any]] = {}
+    sections: dict[str, dict[str, Any]] = {key: {} for key in ("", *_SECTIONS)}
+    for key, value in values.items():
+        with problems.gathered():
+            _check_known(key, value, problems.full())
+            section, _, name = key.rpartition(".")
+            if section in sections:
+                sections[section][name] = value
+            else:
+                own.setdefault(int(section.partition(".")[2]), {})[name] = value
+    if tables:
+        sections["flagella"].setdefault("count", tables)
+    built: dict[str, Any] = {}
+    for key, cls in _SECTIONS.items():
+        with problems.gathered():
+            built[key] = cls(**sections[key])
+    count = tables
+    if own and not tables:
+        count = built["flagella"].count if "flagella" in built else max(own) + 1
+    for k in own:
+        if k >= count:
+            name, value = next(iter(own[k].items()))
+            with problems.gathered():
+                raise SceneError(f"flagellum.{k}.{name}", value, f"there are flagella 0 to {count - 1}")
+    overrides = []
+    for k in range(min(count, int(Flagella.settings["count"].high)) if not problems.full() else 0):
+        with problems.gathered():
+            overrides.append(_override(k, own.get(k, {})))
+    for name, setting in Scene.settings.items():
+        with problems.gathered():
+            if name in sections[""]:
+                setting.checked(name, sections[""][name])
+            elif name == "name":
+                raise SceneError(name, None, f"must be {setting.allowed}")
+    problems.raise_any()
+    return Scene(**sections[""], **built, flagellum=tuple(overrides))
+
+
+def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
+    try:
+        return FlagellumOverride(**values)
+    except SceneError as error:
+        # The class doesn't know which of the tables it is.
+        told = [
+            SceneError(f"flagellum.{k}.{str(e.key).rpartition('.')[2]}", e.value, e.problem)
+            for e in (error, *error.others)
+        ]
+        raise SceneError.joined(told) from None
+
+
+def _check_known(key: str, value: Any, brief: bool) -> None:
+    """Raises SceneError for a key that no scene has; `brief`: without looking for one that it resembles."""
+    if key in _SECTIONS:
+        raise SceneError(key, value, f"is a section: [{key}] with {', '.join(_SECTIONS[key].settings)}")
+    if key == "flagellum":
+        raise SceneError(key, value, "must be tables [[flagellum]], one per flagellum")
+    indexed = re.fullmatch(r"flagellum\.(0|[1-9]\d{0,8})\.(.+)", key)
+    plain = f"flagellum.{indexed[2]}" if indexed else key
+    if plain in _KEYS and (indexed or not key.startswith("flagellum.")):
+        return
+    if brief:
+        raise SceneError(key, value, "unknown key")
+    near = scene_file.nearest(plain, _KEYS if "." in plain else [*_SECTIONS, *_KEYS])
+    if near and near.startswith("flagellum."):
+        near = near.replace("flagellum.", f"flagellum.{indexed[1] if indexed else 'K'}.")
+    section = plain.rpartition(".")[0]
+    siblings = [other.rpartition(".")[2] for other in _KEYS if other.rpartition(".")[0] == section]
+    hint = f"did you mean {near}?" if near else "known here: " + ", ".join(siblings or _SECTIONS)
+    raise SceneError(key, value, f"unknown key; {hint}")
