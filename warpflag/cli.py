@@ -1,6 +1,7 @@
-"""The command line: `warpflag run`, `check`, `plot`, `render`, `export`, `devices`.
+"""The command line: `warpflag run`, `sweep`, `check`, `plot`, `render`, `export`, `compile`, `devices`.
 
-Exit status: 0 done; 2 bad input, told in one line; 3 a guard stopped the run; 130 interrupted, resumable. Everything
+Exit status: 0 done; 1 the machine failed the run (disk full, no permission); 2 bad input, told in one line; 3 a guard
+stopped the run; 130 interrupted by Ctrl-C, 143 terminated by a signal or out of wall time, both resumable. Everything
 heavy is imported by the command that needs it.
 """
 
@@ -14,12 +15,14 @@ from typing import TYPE_CHECKING, NoReturn
 from warpflag import __version__
 
 if TYPE_CHECKING:
+    from warpflag.run.run import Run
     from warpflag.scene import Scene
     from warpflag.view.usd import Shot
 
 __all__ = ["main"]
 
-DONE, FAILED, BAD_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, FAILED, BAD_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 130, 143
+_STATUS = {"done": DONE, "failed": FAILED, "stopped": STOPPED, "interrupted": INTERRUPTED, "terminated": TERMINATED}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -37,9 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _bad_input() as error:
         return _say(_located(error, options), BAD_INPUT)
     except OSError as error:
-        return _say(error, FAILED)
-    except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+        return _say(f"{error.filename}: {error.strerror}" if error.filename else error, FAILED)
+    except KeyboardInterrupt as error:
+        status, reason = getattr(error, "status", "interrupted"), getattr(error, "reason", "")
+        return _say(status + (f" ({reason})" if reason else ""), _STATUS[status])
 
 
 def _say(message: object, status: int) -> int:
@@ -52,10 +56,11 @@ def _bad_input() -> tuple[type[Exception], ...]:
     from warpflag.base.output import OutputError
     from warpflag.record import RecordError
     from warpflag.run.checkpoint import CheckpointError
+    from warpflag.run.lock import LockedError
     from warpflag.run.run_directory import RunError
     from warpflag.scene import SceneError
 
-    return CheckpointError, DeviceError, OutputError, RecordError, RunError, SceneError
+    return CheckpointError, DeviceError, LockedError, OutputError, RecordError, RunError, SceneError
 
 
 def _located(error: Exception, options: argparse.Namespace) -> Exception:
@@ -77,7 +82,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("scene", nargs="?", metavar="SCENE.toml", help="the scene to run")
     run.add_argument("--resume", metavar="DIR", help="continue the run in DIR; of --set it takes duration only")
     run.add_argument("-o", dest="output", metavar="DIR", help="run directory (default: runs/NAME, never overwritten)")
+    run.add_argument("--resume-or-start", action="store_true", help="continue the run in -o DIR, or start it there")
     run.add_argument("--quiet", action="store_true", help="print errors only")
+    _add_limits(run)
     run.set_defaults(command=_run)
 
     check = commands.add_parser(
@@ -158,6 +165,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _add_limits(command: argparse.ArgumentParser) -> None:
+    """What limits the wall time of a command that runs scenes."""
+    command.add_argument(
+        "--max-wall", type=_wall_time, metavar="TIME", help="end resumable after [[D-]HH:]MM:SS or seconds, status 143"
+    )
+    command.add_argument(
+        "--checkpoint-interval", type=_wall_time, metavar="TIME", help="wall time between checkpoints (default: 5)"
+    )
+
+
 def _run(options: argparse.Namespace) -> int:
     if options.scene is None and options.set and "=" not in options.set[-1]:
         options.scene = options.set.pop()  # run --set key=value SCENE.toml
@@ -165,17 +182,34 @@ def _run(options: argparse.Namespace) -> int:
         return _say("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
     if options.resume is not None and (options.output or options.precision):
         return _say("--resume goes on in its directory and precision; leave out -o and --precision", BAD_INPUT)
-    from warpflag.run import run
+    if options.resume_or_start and not (options.scene and options.output):
+        return _say("--resume-or-start needs a SCENE.toml and -o DIR", BAD_INPUT)
+    from warpflag.run.stop import Stop
 
-    if options.resume is not None:
-        outcome = run.resume(options.resume, options.set, options.device).execute(options.quiet)
-    else:
-        outcome = run.start(_scene(options), options.output, options.device).execute(options.quiet)
+    with Stop(options.max_wall) as stop:
+        outcome = _started(options).execute(options.quiet, stop)
     if outcome.status != "done":
-        return _say(outcome.message, {"stopped": STOPPED, "interrupted": INTERRUPTED}[outcome.status])
+        return _say(outcome.message, _STATUS[outcome.status])
     if not options.quiet:
         print(outcome.message)
     return DONE
+
+
+def _started(options: argparse.Namespace) -> Run:
+    """The run that `warpflag run` was asked for."""
+    from pathlib import Path
+
+    from warpflag.run import run
+    from warpflag.run.run_directory import SCENE_NAME, check_same_scene
+
+    limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
+    if options.resume is not None:
+        return run.resume(options.resume, options.set, options.device, **limits)
+    scene = _scene(options)
+    if options.resume_or_start and (Path(options.output) / SCENE_NAME).exists():
+        check_same_scene(Path(options.output), scene)
+        return run.resume(options.output, device=options.device, **limits)
+    return run.start(scene, options.output, options.device, **limits)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -280,6 +314,15 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
     return int(width), int(height)
+
+
+def _wall_time(text: str) -> float:
+    from warpflag.run.stop import wall_seconds
+
+    try:
+        return wall_seconds(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _devices(options: argparse.Namespace) -> int:

@@ -32,20 +32,30 @@ def run(stream, clock, *, total=0.015, start=0.0, updates=150, seconds_per_updat
     return progress
 
 
-def test_a_file_gets_a_line_a_second():
+def test_a_file_gets_a_line_a_minute():
     stream = io.StringIO()
-    run(stream, Clock()).close()
+    run(stream, Clock(), seconds_per_update=5.0).close()  # 750 s
     lines = stream.getvalue().splitlines()
-    assert 8 <= len(lines) <= 10
+    assert [line[:5] for line in lines[:3]] == ["  8 %", " 16 %", " 24 %"] and len(lines) == 13
     assert "\r" not in stream.getvalue()
     assert "100 %" in lines[-1] and "15.00 / 15.00 ms" in lines[-1] and "left" not in lines[-1]
 
 
+def test_a_file_gets_a_line_a_percent_where_that_takes_longer():
+    stream, clock = io.StringIO(), Clock()
+    progress = Progress(100.0, stream, clock=clock)
+    progress.update(0.0)
+    for i in range(1, 81):
+        clock.now += 50.0
+        progress.update(i / 4)  # a quarter of a percent in 50 s
+    assert [line[:5] for line in stream.getvalue().splitlines()] == [f"{k:3d} %" for k in range(1, 21)]
+
+
 def test_speed_and_time_left():
     stream, clock = io.StringIO(), Clock()
-    run(stream, clock, updates=51)
+    run(stream, clock, updates=51, seconds_per_update=6.0)
     line = stream.getvalue().splitlines()[-1]
-    assert "34 %" in line and "5.10 / 15.00 ms" in line and "600 ms per ms" in line and "6 s left" in line
+    assert "33 %" in line and "5.00 / 15.00 ms" in line and "60000 ms per ms" in line and "10:00 min left" in line
 
 
 def test_first_moments_tell_nothing_of_the_rate():

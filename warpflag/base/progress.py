@@ -11,13 +11,14 @@ __all__ = ["Progress"]
 
 _BAR_CELLS = 16
 _TERMINAL_INTERVAL = 0.1
-_LOG_INTERVAL = 1.0
+_LOG_INTERVAL = 60.0
+_LOG_SHARE = 0.01
 _TELLING_SECONDS = 2.0
 _TELLING_SHARE = 0.01
 
 
 class Progress:
-    """Shows how far a run is: a bar that is redrawn on a terminal, one line a second at most anywhere else.
+    """Shows how far a run is: a bar that is redrawn on a terminal; anywhere else a line a minute, a percent apart.
 
     The first update sets the point from which speed is measured: call it before the first step (after
     compiling, and at the time from which a run is resumed), then as often as is handy.
@@ -56,7 +57,9 @@ class Progress:
             if self._terminal:
                 self._show(now)
         elif now - self._shown_at >= (_TERMINAL_INTERVAL if self._terminal else _LOG_INTERVAL):
-            self._show(now)
+            before = self._start[1] if self._shown is None else self._shown
+            if self._terminal or time - before >= _LOG_SHARE * self._total:
+                self._show(now)
 
     def close(self) -> None:
         """Shows the last time reported and ends the line."""

@@ -34,7 +34,6 @@ from warpflag.record.record import (
 
 __all__ = ["Recorder"]
 
-_BLOCK_FRAMES = 10
 _BLOCK_SECONDS = 2.0
 _CHUNK_BYTES = 1 << 20
 
@@ -42,17 +41,25 @@ _CHUNK_BYTES = 1 << 20
 class Recorder:
     """Reporter that writes run.h5: start, write frame by frame, flush, close.
 
-    Frames are committed in blocks of 10, or once 2 s have passed since the last block; the first frame at
-    once. After an exception (Ctrl-C) close() commits what is pending.
+    Frames are committed in blocks, or once 2 s have passed since the last block; the first frame at once. After an
+    exception (Ctrl-C) close() commits what is pending.
 
-    path: the file to write. It must not exist, unless resume_step is given: then the frames whose step is
-    larger are cut off and new ones appended.
+    Args:
+        path: the file to write. It must not exist, unless resume_step is given.
+        resume_step: frames of a larger step are cut off the existing file, and new ones appended.
+        block_frames: frames of a block.
+        keep_open: whether the file stays open between blocks. If not, only full blocks and calls of flush are
+            committed: thousands of records can then be written at once.
     """
 
-    def __init__(self, path: str | Path, *, resume_step: int | None = None):
+    def __init__(
+        self, path: str | Path, *, resume_step: int | None = None, block_frames: int = 10, keep_open: bool = True
+    ):
         self.path = Path(path)
         self._resume_step = resume_step
+        self._block_frames, self._keep_open = block_frames, keep_open
         self._file: Any = None
+        self._set_aside = False  # there is a file, closed between two blocks
         self._parameters: dict[str, Any] = {}
         self._datasets: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -100,21 +107,22 @@ class Recorder:
         Raises ValueError where its shapes or observables are not those of the record.
         """
         values = _values(frame)
-        if self._file is None:
+        if self._file is None and not self._set_aside:
             self._create(values)
         shapes = {name: np.shape(value) for name, value in values.items()}
         if shapes != self._shapes:
             wrong = sorted(name for name, _ in shapes.items() ^ self._shapes.items())
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
         self._pending.append(values)
-        late = time.monotonic() - self._last_commit > _BLOCK_SECONDS
-        if late or len(self._pending) >= _BLOCK_FRAMES:
+        late = time.monotonic() - self._last_commit > _BLOCK_SECONDS and (self._keep_open or self._committed == 0)
+        if late or len(self._pending) >= self._block_frames:
             self.flush()
 
     def flush(self) -> None:
         """Commits the frames that are pending: from here on they survive the end of this process."""
         if not self._pending:
             return
+        file = self._open(list(self._shapes)) if self._file is None else self._file
         # Rows start at the committed count, not at a dataset's end: a commit that was interrupted is
         # repeated.
         count = self._committed + len(self._pending)
@@ -123,19 +131,38 @@ class Recorder:
                 dataset = self._datasets[name]
                 dataset.resize(count, axis=0)
                 dataset[self._committed :] = np.stack([values[name] for values in self._pending])
-            self._file.flush()
+            file.flush()
         self._committed = count
         self._pending = []
         self._last_commit = time.monotonic()
+        if not self._keep_open:
+            self._put_aside()
 
     def close(self) -> None:
         """Commits what is pending and closes the file; calling it again does nothing."""
+        try:
+            self.flush()
+        finally:
+            self._put_aside()
+            self._set_aside = False
+
+    def _put_aside(self) -> None:
+        """Closes the file; `flush` opens it again."""
         if self._file is not None:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
-                self._file = None
+            self._datasets = {}
+            self._file.close()
+            self._file, self._set_aside = None, True
+
+    def _open(self, names: list[str]) -> Any:
+        """Opens the file that is there for writing, and returns it."""
+        import h5py
+
+        try:
+            self._file = h5py.File(self.path, "r+")
+        except OSError as error:
+            raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
+        self._datasets = {name: self._file[dataset_path(name)] for name in names}
+        return self._file
 
     def _refuse_existing(self) -> None:
         if self.path.exists():
@@ -177,25 +204,19 @@ class Recorder:
                 file[f"{name}/time"] = file[dataset_path("time")]
             self._write_parameters(file)
         os.replace(temporary, self.path)
-        self._file = h5py.File(self.path, "r+")
-        self._datasets = {name: self._file[dataset_path(name)] for name in values}
+        self._open(list(values))
         self._shapes = {name: np.shape(value) for name, value in values.items()}
 
     def _reopen(self, resume_step: int) -> None:
         """Opens the file again and cuts it to the frames with step <= resume_step."""
-        import h5py
-
         with Record(self.path) as record:
             if not np.array_equal(record.first_node, self._parameters["first_node"]):
                 raise RecordError(f"{self.path}: has other flagella than the run that would continue it")
             self._committed = int(np.searchsorted(record.steps, resume_step, side="right"))
             names = ["step", "time", *ENTRIES, *(f"observables/{name}" for name in record.observables)]
-        try:
-            self._file = h5py.File(self.path, "r+")
-        except OSError as error:
-            raise RecordError(f"{self.path}: can't be continued: {one_line(error)}") from error
+        self._open(names)
         for name in names:  # step first: at any moment no dataset is shorter
-            dataset = self._datasets[name] = self._file[dataset_path(name)]
+            dataset = self._datasets[name]
             dataset.resize(self._committed, axis=0)
             self._file.flush()
             self._shapes[name] = dataset.shape[1:]
@@ -203,6 +224,8 @@ class Recorder:
         self._write_parameters(self._file)
         self._file.flush()
         self._last_commit = time.monotonic()
+        if not self._keep_open:
+            self._put_aside()
 
     def _write_parameters(self, file: Any) -> None:
         group = file.create_group("parameters")
