@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 from collections.abc import Mapping
 from importlib import metadata
@@ -59,5 +60,9 @@ def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> 
 
 def versions() -> dict[str, str]:
     """Versions of this program, of Python and of the packages that it stands on, by name."""
-    packages = {name: metadata.version(name) for name in ("warp-lang", "numpy", "h5py", "usd-core")}
-    return {"warpflag": __version__, "python": platform.python_version(), **packages}
+    return {"warpflag": __version__, "python": platform.python_version(), **_package_versions()}
+
+
+@functools.cache
+def _package_versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in ("warp-lang", "numpy", "h5py", "usd-core")}
