@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, NoReturn
 from warpflag import __version__
 
 if TYPE_CHECKING:
-    from warpflag.run.run import Run
+    from warpflag.run.run import Outcome, Run
+    from warpflag.run.sweep import SweepRun
     from warpflag.scene import Scene
     from warpflag.view.usd import Shot
 
@@ -86,6 +87,34 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--quiet", action="store_true", help="print errors only")
     _add_limits(run)
     run.set_defaults(command=_run)
+
+    sweep = commands.add_parser(
+        "sweep",
+        help="run a scene many times with varied values, or resume a sweep",
+        description="Runs all members of a sweep file, or of a scene file and --grid; a run directory each.",
+    )
+    sweep.add_argument("scene", nargs="?", metavar="SWEEP.toml", help="a sweep file, or a scene file for --grid")
+    sweep.add_argument("--resume", metavar="DIR", help="continue the sweep in DIR; what is done is skipped")
+    sweep.add_argument("-o", dest="output", metavar="DIR", help="its directory (default: runs/NAME, never overwritten)")
+    sweep.add_argument("--resume-or-start", action="store_true", help="continue the sweep in -o DIR, or start it there")
+    sweep.add_argument(
+        "--grid",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=FROM:TO:COUNT",
+        help="an axis, also KEY=A,B,C; several make all combinations",
+    )
+    sweep.add_argument(
+        "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="replace values of the base scene"
+    )
+    sweep.add_argument("--workers", type=int, metavar="N", help="processes (default: one per GPU, or one per core)")
+    sweep.add_argument("--device", help="of all workers (default: every GPU in turn, or the CPU)")
+    sweep.add_argument("--movies", action="store_true", help="a movie of every member")
+    sweep.add_argument("--share", type=_share, default=(0, 1), metavar="K/N", help="only share K, from 0, of N")
+    sweep.add_argument("--quiet", action="store_true", help="print errors only")
+    _add_limits(sweep)
+    sweep.set_defaults(command=_sweep)
 
     check = commands.add_parser(
         "check",
@@ -187,7 +216,44 @@ def _run(options: argparse.Namespace) -> int:
     from warpflag.run.stop import Stop
 
     with Stop(options.max_wall) as stop:
-        outcome = _started(options).execute(options.quiet, stop)
+        return _told(_started(options).execute(options.quiet, stop), options)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    if options.scene is None and options.set and "=" not in options.set[-1]:
+        options.scene = options.set.pop()
+    if (options.scene is None) == (options.resume is None):
+        return _say("sweep needs either a SWEEP.toml or --resume DIR", BAD_INPUT)
+    if options.resume is not None and (options.output or options.grid or options.set):
+        return _say("--resume goes on with the sweep of its directory; leave out -o, --grid and --set", BAD_INPUT)
+    if options.resume_or_start and not (options.scene and options.output):
+        return _say("--resume-or-start needs a SWEEP.toml and -o DIR", BAD_INPUT)
+    from warpflag.run.stop import Stop
+    from warpflag.run.sweep import BadMembers
+
+    limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
+    with Stop(options.max_wall) as stop:
+        try:
+            sweep = _started_sweep(options)
+        except BadMembers as error:
+            return _say(str(error).replace("\n", "\nwarpflag: "), BAD_INPUT)
+        limits |= {"movies": options.movies, "share": options.share}
+        outcome = sweep.execute(options.workers, options.device, options.quiet, stop, **limits)
+    return _told(outcome, options)
+
+
+def _started_sweep(options: argparse.Namespace) -> SweepRun:
+    """The sweep that `warpflag sweep` was asked for."""
+    from warpflag.run import sweep
+
+    if options.scene is None:
+        return sweep.resume(options.resume)
+    plan = sweep.read(options.scene, options.set, options.grid)
+    return (sweep.resume_or_start if options.resume_or_start else sweep.start)(plan, options.output)
+
+
+def _told(outcome: Outcome, options: argparse.Namespace) -> int:
+    """Says how runs have ended; returns the exit status."""
     if outcome.status != "done":
         return _say(outcome.message, _STATUS[outcome.status])
     if not options.quiet:
@@ -314,6 +380,14 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
     return int(width), int(height)
+
+
+def _share(text: str) -> tuple[int, int]:
+    """Number and count of "2/8"."""
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and int(number) < int(count)):
+        raise argparse.ArgumentTypeError(f"{text} is not of the form 2/8, the first from 0")
+    return int(number), int(count)
 
 
 def _wall_time(text: str) -> float:

@@ -21,7 +21,7 @@ class Lock:
     """Keeps a run directory for this process until `release`, or until the process ends.
 
     The lock is one byte of the file .lock: in the run directory, or, for a member of a sweep, in the sweep's directory
-    at the member's number, so that a thousand members take one open file.
+    at a byte of the member's own, so that a thousand members take one open file.
 
     Args:
         directory: the run directory; it exists.
@@ -34,7 +34,7 @@ class Lock:
         directory = directory.resolve()
         member = (directory.parent / SWEEP_NAME).is_file() and directory.name.isdecimal()
         file = (directory.parent if member else directory) / LOCK_NAME
-        self._key = (file, int(directory.name) if member else 0)
+        self._key = (file, int(directory.name) + 1 if member else 0)
         if self._key in _held or not _locked(*self._key):
             raise LockedError(f"{directory}: is being written by another process")
         _held.add(self._key)

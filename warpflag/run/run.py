@@ -78,11 +78,18 @@ def start_batch(
         As `start`.
     """
     simulation = Simulation(scenes, device=device, strict=strict)
+    locks: list[Lock] = []
     members = []
-    for scene, path in zip(scenes, directories, strict=True):
-        directory, lock = claim_directory(scene.name, str(path))
-        write_whole(directory / SCENE_NAME, dumps(scene))
-        members.append(Member(directory, scene, lock, alone=len(scenes) == 1))
+    try:
+        for scene, path in zip(scenes, directories, strict=True):
+            directory, lock = claim_directory(scene.name, str(path))
+            locks.append(lock)
+            write_whole(directory / SCENE_NAME, dumps(scene))
+            members.append(Member(directory, scene, lock, alone=len(scenes) == 1))
+    except BaseException:
+        for lock in locks:
+            lock.release()
+        raise
     return Run(simulation, members, **options)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -17,7 +16,6 @@ from warpflag_kernels.stepping import health
 from warpflag.base.device import find_device
 from warpflag.model.build import build_chart, build_control, build_guard, build_model, build_state
 from warpflag.model.geometry import InitialState
-from warpflag.model.start import starting_state
 from warpflag.model.terms import launch_right_hand_side
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
@@ -25,6 +23,7 @@ from warpflag.record.reporters import Reporter, start_reporter
 from warpflag.run.cells import Cells, CellsReader
 from warpflag.run.faults import NumericalError
 from warpflag.run.frames import frames_of
+from warpflag.run.starts import starting_states
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 
@@ -68,7 +67,7 @@ class Simulation:
     ) -> None:
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         if starts is None:
-            starts = _starting_states(self.scenes)
+            starts = starting_states(self.scenes)
         elif isinstance(starts, InitialState):
             starts = [starts]
         precision = Precision(self.scenes[0].numerics.precision, strict)
@@ -349,17 +348,3 @@ class Simulation:
         chart.rest.zero_()
         s.data.active.zero_()
         self._checked = True
-
-
-def _starting_states(scenes: Sequence[Scene]) -> list[InitialState]:
-    """The starts of scenes; those that differ only in what leaves the shape alone share theirs."""
-    found: dict[Scene, InitialState] = {}
-    starts = []
-    for scene in scenes:
-        own = tuple(dataclasses.replace(flagellum, torque=None) for flagellum in scene.flagellum)
-        motor = dataclasses.replace(scene.motor, torque=1.0)
-        shape = dataclasses.replace(scene, name="shape", duration=1.0, frames=1, motor=motor, flagellum=own)
-        if shape not in found:
-            found[shape] = starting_state(scene)
-        starts.append(found[shape])
-    return starts
