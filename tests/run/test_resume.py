@@ -118,6 +118,17 @@ def test_a_record_without_any_checkpoint_is_made_again(tmp_path):
     assert_same_frames(whole, late)
 
 
+def test_a_run_killed_after_its_last_frame_is_completed(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    before = arrays(directory)
+    for name in ("summary.json", "movie.usdc"):
+        (directory / name).unlink()
+    assert run.resume(str(directory)).execute(quiet=True).status == "done"
+    assert (directory / "movie.usdc").exists() and summary(directory)["status"] == "done"
+    for name, values in arrays(directory).items():
+        np.testing.assert_array_equal(values, before[name])
+
+
 def test_a_finished_run_says_that_it_is_done(tmp_path):
     directory = executed(small(), tmp_path / "made")
     before = (directory / "run.h5").read_bytes()

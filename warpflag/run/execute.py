@@ -132,10 +132,7 @@ class Run:
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
             if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, self.checkpoint_seconds):
                 self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
-            self._save(sorted(at_end))
-            for cell in at_end:
-                finish = functools.partial(self.members[cell].finish, "done", movie=self.movies)
-                self._guarded(cell, lambda c=cell, f=finish: f(self._facts(c)))
+            self._complete(sorted(at_end))
             self._stop(faults)
             if monotonic() - saved > interval:
                 began = monotonic()
@@ -143,9 +140,18 @@ class Run:
                 saved = monotonic()
                 interval = max(self.checkpoint_seconds, (saved - began) / _CHECKPOINT_SHARE)
             look()
-        faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
-        self._copy = self.simulation.checkpoint() if faults else self._copy
+        # What the loop has not seen: cells whose start a guard refuses, and runs that were resumed at their end.
+        self._copy = self.simulation.checkpoint()
+        faults = self.simulation.faults
         self._stop(faults)
+        self._complete([c for c, member in enumerate(self.members) if member.outcome is None and c not in faults])
+
+    def _complete(self, cells: Sequence[int]) -> None:
+        """Ends members that have reached the end of their scenes."""
+        self._save(cells)
+        for cell in cells:
+            finish = functools.partial(self.members[cell].finish, "done", movie=self.movies)
+            self._guarded(cell, lambda c=cell, f=finish: f(self._facts(c)))
 
     def _guarded(self, cell: int, action: Callable[[], Any]) -> Any:
         """What a member does with its files; where the machine refuses, the member ends and the others go on."""
