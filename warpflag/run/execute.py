@@ -21,10 +21,9 @@ from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 
-__all__ = ["CHECKPOINT_SECONDS", "Run"]
+__all__ = ["Run"]
 
-CHECKPOINT_SECONDS = 5.0
-"""Wall time between two checkpoints unless another is given [s]."""
+_CHECKPOINT_SECONDS = 5.0
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05
 _WRITERS = 8
@@ -38,7 +37,7 @@ class Run:
         simulation: None where there is nothing left to do.
         members: the run of each cell.
         movies: whether each run gets a movie at its end.
-        checkpoint_seconds: wall time between two checkpoints [s].
+        checkpoint_seconds: wall time between two checkpoints [s]; None: 5 s, more where they take long to write.
     """
 
     def __init__(
@@ -46,9 +45,10 @@ class Run:
         simulation: Simulation | None,
         members: Sequence[Member],
         movies: bool = True,
-        checkpoint_seconds: float = CHECKPOINT_SECONDS,
+        checkpoint_seconds: float | None = None,
     ) -> None:
-        self.members, self.movies, self.checkpoint_seconds = list(members), movies, checkpoint_seconds
+        self.members, self.movies = list(members), movies
+        self._given_interval = checkpoint_seconds
         self._simulation = simulation
         # The last copy of all cells at a frame, and when it was taken: what a checkpoint is written from.
         self._copy: dict[str, np.ndarray] = {}
@@ -124,13 +124,14 @@ class Run:
             timer.cancel()
 
     def _record(self, look: Callable[[], None]) -> None:
-        saved, interval = monotonic(), self.checkpoint_seconds
+        given = self._given_interval
+        saved, interval = monotonic(), _CHECKPOINT_SECONDS if given is None else given
         for frames in self.simulation.cell_frames(watch=look):
             at_end = {
                 c for c, frame in frames.items() if self._guarded(c, lambda c=c, f=frame: self.members[c].write(f))
             }
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
-            if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, self.checkpoint_seconds):
+            if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):
                 self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
             self._complete(sorted(at_end))
             self._stop(faults)
@@ -138,7 +139,8 @@ class Run:
                 began = monotonic()
                 self._save(range(len(self.members)))
                 saved = monotonic()
-                interval = max(self.checkpoint_seconds, (saved - began) / _CHECKPOINT_SHARE)
+                if given is None:
+                    interval = max(_CHECKPOINT_SECONDS, (saved - began) / _CHECKPOINT_SHARE)
             look()
         # What the loop has not seen: cells whose start a guard refuses, and runs that were resumed at their end.
         self._copy = self.simulation.checkpoint()

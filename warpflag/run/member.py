@@ -60,6 +60,7 @@ class Member:
         self.directory, self.scene = directory, scene
         self.outcome: Outcome | None = None
         self._lock = lock
+        self._saved_time = resumed["time"] if resumed else -1.0
         self._began = monotonic() - (resumed["wall_time"] if resumed else 0.0)
         buffered = {} if alone else {"block_frames": 64, "keep_open": False}
         step = resumed["step"] if resumed else None
@@ -80,15 +81,18 @@ class Member:
         return self.recorder.frame_count == self.scene.frames + 1
 
     def save(self, arrays: Mapping[str, np.ndarray], device: str) -> None:
-        """Writes a checkpoint, the frames before it first.
+        """Writes a checkpoint, the frames before it first; the one of the last checkpoint's time is there already.
 
         Args:
             arrays: the checkpoint of the cell at one of its recorded frames.
             device: that it was computed on.
         """
+        step, time = int(arrays["control.steps"][0]), float(arrays["control.time"][0])
+        if time == self._saved_time:
+            return
         meta = {
-            "step": int(arrays["control.steps"][0]),
-            "time": float(arrays["control.time"][0]),
+            "step": step,
+            "time": time,
             "wall_time": self.wall_time,
             "device": device,
             "dynamics_sha256": dynamics_sha256(self.scene),
@@ -97,6 +101,7 @@ class Member:
         self.recorder.flush()
         sync(self.recorder.path)
         checkpoint.save(self.directory, arrays, meta)
+        self._saved_time = time
 
     def finish(
         self,

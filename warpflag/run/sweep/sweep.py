@@ -13,7 +13,6 @@ from typing import Any
 from warpflag.base.device import start_warp
 from warpflag.base.progress import Progress
 from warpflag.model.build import switches_of
-from warpflag.run.execute import CHECKPOINT_SECONDS
 from warpflag.run.lock import SWEEP_NAME, Lock, LockedError
 from warpflag.run.member import Outcome
 from warpflag.run.run import begun_at_checkpoint
@@ -68,7 +67,7 @@ class SweepRun:
         stop: Stop | None = None,
         movies: bool = False,
         share: tuple[int, int] = (0, 1),
-        checkpoint_seconds: float = CHECKPOINT_SECONDS,
+        checkpoint_seconds: float | None = None,
     ) -> Outcome:
         """Runs what is not finished.
 
@@ -79,7 +78,7 @@ class SweepRun:
             stop: what may end the sweep before its time; default: signals.
             movies: whether each member gets a movie.
             share: (k, n): only the k-th of n equal shares of the members.
-            checkpoint_seconds: wall time between two checkpoints [s].
+            checkpoint_seconds: wall time between two checkpoints [s]; None: as `Run` has it.
 
         Returns:
             done; stopped, where guards stopped members; failed, where the machine failed some; interrupted or
