@@ -12,11 +12,10 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from warpflag import __version__
+from warpflag import __version__, sweep_command
 
 if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
-    from warpflag.run.sweep import SweepRun
     from warpflag.scene import Scene
     from warpflag.view.usd import Shot
 
@@ -38,13 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.command(options)
-    except _bad_input() as error:
-        return _say(_located(error, options), BAD_INPUT)
-    except OSError as error:
-        return _say(f"{error.filename}: {error.strerror}" if error.filename else error, FAILED)
     except KeyboardInterrupt as error:
         status, reason = getattr(error, "status", "interrupted"), getattr(error, "reason", "")
         return _say(status + (f" ({reason})" if reason else ""), _STATUS[status])
+    except _bad_input() as error:  # after the interrupt, which may have come while these were being imported
+        return _say(str(_located(error, options)).replace("\n", "\nwarpflag: "), BAD_INPUT)
+    except OSError as error:
+        return _say(f"{error.filename}: {error.strerror}" if error.filename else error, FAILED)
 
 
 def _say(message: object, status: int) -> int:
@@ -59,9 +58,11 @@ def _bad_input() -> tuple[type[Exception], ...]:
     from warpflag.run.checkpoint import CheckpointError
     from warpflag.run.lock import LockedError
     from warpflag.run.run_directory import RunError
+    from warpflag.run.sweep import BadMembers
     from warpflag.scene import SceneError
 
-    return CheckpointError, DeviceError, LockedError, OutputError, RecordError, RunError, SceneError
+    found = (BadMembers, CheckpointError, DeviceError, LockedError, OutputError, RecordError, RunError, SceneError)
+    return (*found, sweep_command.OptionError)
 
 
 def _located(error: Exception, options: argparse.Namespace) -> Exception:
@@ -88,33 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_limits(run)
     run.set_defaults(command=_run)
 
-    sweep = commands.add_parser(
-        "sweep",
-        help="run a scene many times with varied values, or resume a sweep",
-        description="Runs all members of a sweep file, or of a scene file and --grid; a run directory each.",
-    )
-    sweep.add_argument("scene", nargs="?", metavar="SWEEP.toml", help="a sweep file, or a scene file for --grid")
-    sweep.add_argument("--resume", metavar="DIR", help="continue the sweep in DIR; what is done is skipped")
-    sweep.add_argument("-o", dest="output", metavar="DIR", help="its directory (default: runs/NAME, never overwritten)")
-    sweep.add_argument("--resume-or-start", action="store_true", help="continue the sweep in -o DIR, or start it there")
-    sweep.add_argument(
-        "--grid",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=FROM:TO:COUNT",
-        help="an axis, also KEY=A,B,C; several make all combinations",
-    )
-    sweep.add_argument(
-        "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="replace values of the base scene"
-    )
-    sweep.add_argument("--workers", type=int, metavar="N", help="processes (default: one per GPU, or one per core)")
-    sweep.add_argument("--device", help="of all workers (default: every GPU in turn, or the CPU)")
-    sweep.add_argument("--movies", action="store_true", help="a movie of every member")
-    sweep.add_argument("--share", type=_share, default=(0, 1), metavar="K/N", help="only share K, from 0, of N")
-    sweep.add_argument("--quiet", action="store_true", help="print errors only")
-    _add_limits(sweep)
-    sweep.set_defaults(command=_sweep)
+    sweep_command.add(commands, _add_limits).set_defaults(command=_sweep)
 
     check = commands.add_parser(
         "check",
@@ -133,17 +108,21 @@ def _parser() -> argparse.ArgumentParser:
 
     plot = commands.add_parser(
         "plot",
-        help="draw the curves of runs",
+        help="draw the curves of runs, or the numbers of a sweep",
         description="Draws bundle length, phase difference and contact force of runs over time; needs matplotlib, the "
-        "extra plot. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
+        "extra plot. The bundle length passes over gaps of 1 um; run.h5 has the plain one. Of a sweep it draws numbers "
+        "of its table against an axis, or maps over two.",
     )
-    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory")
+    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory, or the directory of one sweep")
+    plot.add_argument("--x", metavar="COLUMN", help="of a sweep: draw against this column (default: its first axis)")
+    plot.add_argument("--y", nargs="+", default=[], metavar="COLUMN", help="of a sweep: numbers of its table to draw")
     plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
     plot.add_argument(
         "--as",
         dest="kind",
-        choices=("series", "comparison"),
-        help="panels with contact forces, or one of all runs (default: series of one run, comparison of several)",
+        choices=("series", "comparison", "curves", "map"),
+        help="panels with contact forces, or one of all runs (default: series of one run, comparison of several); "
+        "of a sweep curves or a map (default: map of two axes)",
     )
     plot.set_defaults(command=_plot)
 
@@ -220,36 +199,11 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    if options.scene is None and options.set and "=" not in options.set[-1]:
-        options.scene = options.set.pop()
-    if (options.scene is None) == (options.resume is None):
-        return _say("sweep needs either a SWEEP.toml or --resume DIR", BAD_INPUT)
-    if options.resume is not None and (options.output or options.grid or options.set):
-        return _say("--resume goes on with the sweep of its directory; leave out -o, --grid and --set", BAD_INPUT)
-    if options.resume_or_start and not (options.scene and options.output):
-        return _say("--resume-or-start needs a SWEEP.toml and -o DIR", BAD_INPUT)
-    from warpflag.run.stop import Stop
-    from warpflag.run.sweep import BadMembers
-
-    limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
-    with Stop(options.max_wall) as stop:
-        try:
-            sweep = _started_sweep(options)
-        except BadMembers as error:
-            return _say(str(error).replace("\n", "\nwarpflag: "), BAD_INPUT)
-        limits |= {"movies": options.movies, "share": options.share}
-        outcome = sweep.execute(options.workers, options.device, options.quiet, stop, **limits)
-    return _told(outcome, options)
-
-
-def _started_sweep(options: argparse.Namespace) -> SweepRun:
-    """The sweep that `warpflag sweep` was asked for."""
-    from warpflag.run import sweep
-
-    if options.scene is None:
-        return sweep.resume(options.resume)
-    plan = sweep.read(options.scene, options.set, options.grid)
-    return (sweep.resume_or_start if options.resume_or_start else sweep.start)(plan, options.output)
+    outcome = sweep_command.sweep(options)
+    if not isinstance(outcome, str):
+        return _told(outcome, options)
+    print(outcome)
+    return DONE
 
 
 def _told(outcome: Outcome, options: argparse.Namespace) -> int:
@@ -310,8 +264,14 @@ def _scene(options: argparse.Namespace) -> Scene:
 def _plot(options: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from warpflag.view import figures
+    from warpflag.view import figures, sweep_figures
 
+    if sweep_figures.is_sweep(options.directories[0]):
+        figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
+        print(options.output)
+        return DONE
+    if options.x or options.y or options.kind in ("curves", "map"):
+        return _say(f"{options.directories[0]}: is no sweep, which --x, --y, curves and map are for", BAD_INPUT)
     names = [Path(directory).resolve().name for directory in options.directories]
     labels = names if len(set(names)) == len(names) else options.directories
     runs = [figures.read(directory, label) for directory, label in zip(options.directories, labels, strict=True)]
@@ -380,14 +340,6 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
     return int(width), int(height)
-
-
-def _share(text: str) -> tuple[int, int]:
-    """Number and count of "2/8"."""
-    number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and int(number) < int(count)):
-        raise argparse.ArgumentTypeError(f"{text} is not of the form 2/8, the first from 0")
-    return int(number), int(count)
 
 
 def _wall_time(text: str) -> float:

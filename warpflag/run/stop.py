@@ -11,7 +11,7 @@ from typing import Any
 
 __all__ = ["Ended", "Stop", "wall_seconds"]
 
-_TERMINATING = ("SIGTERM", "SIGHUP", "SIGUSR1", "SIGXCPU")
+_TERMINATING = ("SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 
 
 class Ended(KeyboardInterrupt):
@@ -25,8 +25,8 @@ class Ended(KeyboardInterrupt):
 class Stop:
     """Notices signals while its `with` block runs; the run asks `check` at moments when it can end in order.
 
-    Ctrl-C (INT) interrupts; TERM, HUP, USR1 and XCPU terminate, as does the wall time. A second INT ends the process
-    wherever it is.
+    Ctrl-C (INT) interrupts; TERM, HUP, USR1, USR2 and XCPU terminate, as does the wall time. A second INT ends the
+    process wherever it is.
 
     Args:
         max_wall: wall time from now on after which the run is to end [s]; None: no limit.

@@ -25,9 +25,10 @@ from warpflag.run.sweep.pool import Batch, Pool
 from warpflag.scene import SceneError
 from warpflag.scene.resistance import filament_mobility
 
-__all__ = ["SweepRun", "resume", "resume_or_start", "start"]
+__all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 
-_FINISHED = ("done", "stopped")
+FINISHED = ("done", "stopped")
+"""Statuses of members that are not run again."""
 _LARGEST_BATCH = {"cpu": 64, "cuda": 512}
 _BATCHES_PER_WORKER = 4
 _SAMPLE_CELLS = 8
@@ -89,7 +90,7 @@ class SweepRun:
                 return self.execute(workers, device, quiet, signals, movies, share, checkpoint_seconds)
         began = monotonic()
         own = range(len(self.members))[share[0] :: share[1]]
-        pending = [k for k in own if table.status_of(self.directory / self.names[k]) not in _FINISHED]
+        pending = [k for k in own if table.status_of(self.directory / self.names[k]) not in FINISHED]
         ended: Ended | None = None
         failed: dict[int, str] = {}
         if pending:
@@ -183,6 +184,13 @@ class SweepRun:
             )
         return size
 
+    def seconds_per_member(self, pending: Sequence[int], device: str | None, stop: Stop) -> float:
+        """Wall time of a member on one worker, the lesser of alone and in a batch, measured on a few of them [s]."""
+        group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
+        with Pool([device or _devices()[0]], {}) as pool:
+            alone, together = pool.measure([self.members[k].scene for k in group], stop)
+        return min(alone, together)
+
     def _groups(self, pending: Sequence[int]) -> list[list[int]]:
         """Members that one simulation can advance: the same terms, precision and stepper, all begun or none."""
         groups: dict[object, list[int]] = {}
@@ -225,7 +233,7 @@ class SweepRun:
             reason = f" ({ended.reason})" if ended.reason else ""
             return Outcome(ended.status, f"{told}; {ended.status}{reason}; resumable with --resume {self.directory}")
         told += f" in {seconds:.1f} s: {self.directory / table.TABLE_NAME}"
-        if failed or set(counts) - set(_FINISHED):
+        if failed or set(counts) - set(FINISHED):
             return Outcome("failed", f"{told}; resumable with --resume {self.directory}")
         return Outcome("stopped" if "stopped" in counts else "done", told)
 
