@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,6 +134,20 @@ def figure(
     return curves(table, x, numbers)
 
 
+@contextmanager
+def _style() -> Iterator[None]:
+    """The type sizes of print, for all that is drawn within."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise OutputError("figures need matplotlib: install warpflag with its extra, warpflag[plot]") from None
+    matplotlib.use("agg")
+    style: Any = STYLE
+    with matplotlib.rc_context(style):
+        yield
+
+
+@_style()
 def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> Figure:
     """A panel per number against one column; mean and standard error where rows share it; a line per second axis.
 
@@ -155,7 +170,7 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
             rows = [values[(line_of == k) & (position == place) & np.isfinite(values)] for place in places]
             means = [row.mean() if len(row) else math.nan for row in rows]
             errors = [row.std(ddof=1) / math.sqrt(len(row)) if len(row) > 1 else 0.0 for row in rows]
-            label = f"{_leaf(others[0])} {line}" if others else None
+            label = f"{_leaf(others[0])} {_short(line)}".replace("_", " ") if others else None
             color = COLORS[k % len(COLORS)]
             panel.errorbar(places, means, errors, marker="o", markersize=3, capsize=2, color=color, label=label)
         panel.set_xlabel(_label(x))
@@ -165,6 +180,7 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
     return figure
 
 
+@_style()
 def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
     """A map per number over the first two axes, means over what else varies; what there is not is left blank.
 
@@ -219,19 +235,12 @@ def _drawn(table: Table, numbers: Sequence[str]) -> list[str]:
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    try:
-        import matplotlib
-    except ImportError:
-        raise OutputError("figures need matplotlib: install warpflag with its extra, warpflag[plot]") from None
-    matplotlib.use("agg")
     from matplotlib import pyplot
 
     columns = min(count, 2)
     rows = -(-count // columns)
-    style: Any = STYLE
-    with pyplot.rc_context(style):
-        size = (COLUMN if columns == 1 else TWO_COLUMNS, 2.4 * rows)
-        figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    size = (COLUMN if columns == 1 else TWO_COLUMNS, 2.4 * rows)
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
     for axis in axes.flat[count:]:
         axis.remove()
     return figure, list(axes.flat[:count])

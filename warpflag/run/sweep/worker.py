@@ -8,6 +8,7 @@ also when the process that started it is gone, the worker ends its batch resumab
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -19,6 +20,7 @@ from time import monotonic, perf_counter
 from typing import Any, TextIO
 
 from warpflag.run import run
+from warpflag.run.faults import NumericalError
 from warpflag.run.member import Outcome
 from warpflag.run.run_directory import SCENE_NAME
 from warpflag.run.simulation import Simulation
@@ -28,7 +30,8 @@ from warpflag.scene import Scene, loads
 __all__ = ["main"]
 
 _SECONDS_PER_WORD = 0.2
-_SAMPLE_FRAMES = 2
+_SAMPLE_SECONDS = 0.3
+_FIRST_PART = 64  # of the simulated time is what is timed first
 
 
 def main() -> None:
@@ -111,12 +114,20 @@ def _cost(scenes: list[Scene], device: str | None) -> float:
     began = perf_counter()
     simulation = Simulation(scenes, device=device)
     simulation.prepare()
-    prepared = perf_counter()
-    sample = min(scene.duration * min(1.0, _SAMPLE_FRAMES / scene.frames) for scene in scenes)
-    for _ in zip(range(_SAMPLE_FRAMES + 1), simulation.cell_frames(), strict=False):
-        pass
-    stepping = (perf_counter() - prepared) * max(scene.duration for scene in scenes) / sample
-    return (prepared - began + stepping) / len(scenes)
+    started = perf_counter() - began
+    # Advances that double until one is long enough to time: the first steps after a start are short ones.
+    reached, end = 0.0, min(scene.duration for scene in scenes)
+    until = end / _FIRST_PART
+    while True:
+        began = perf_counter()
+        with contextlib.suppress(NumericalError):
+            simulation.advance(until)
+        taken = perf_counter() - began
+        if taken > _SAMPLE_SECONDS or until >= end:
+            break
+        reached, until = until, min(2 * until, end)
+    stepping = taken / (until - reached) * max(scene.duration for scene in scenes)
+    return (started + stepping) / len(scenes)
 
 
 if __name__ == "__main__":
