@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -133,6 +134,25 @@ def test_a_finished_run_says_that_it_is_done(tmp_path):
     outcome = run.resume(str(directory)).execute(quiet=True)
     assert outcome.status == "done" and "done already" in outcome.message
     assert (directory / "run.h5").read_bytes() == before
+
+
+def test_a_full_disk_fails_a_run_in_one_line_and_it_resumes(tmp_path, monkeypatch):
+    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
+    usage, calls = shutil.disk_usage(tmp_path), []
+
+    def filling(path):
+        calls.append(path)
+        return usage._replace(free=usage.free if len(calls) <= 5 else 1000)
+
+    monkeypatch.setattr(shutil, "disk_usage", filling)
+    outcome = run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0).execute(quiet=True)
+    assert outcome.status == "failed" and "\n" not in outcome.message
+    assert "No space left" in outcome.message and str(halved) in outcome.message
+    with Record(halved) as record:
+        assert record.frame_count == 5
+    monkeypatch.undo()
+    assert run.resume(str(halved)).execute(quiet=True).status == "done"
+    assert_same_frames(whole, halved)
 
 
 LONG = ["run", "long.toml", "-o", "made", "--quiet", "--device", "cpu"]

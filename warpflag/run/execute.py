@@ -162,7 +162,7 @@ class Run:
             return None
         try:
             return action()
-        except (OSError, RecordError) as error:
+        except (OSError, RuntimeError, RecordError) as error:  # HDF5 raises all three
             if isinstance(error, RecordError) and len(self.members) == 1:
                 raise
             member.fail(error)

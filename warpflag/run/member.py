@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +27,11 @@ from warpflag.run.summary import digest, plain
 from warpflag.scene import Scene
 
 __all__ = ["Member", "Outcome"]
+
+# HDF5 leaves a file that can't be opened when a write of its own fails, so the disk is looked at before: room for a
+# chunk of frames, twice, and for checkpoint and summary.
+_LEAST_ROOM = 1 << 18
+_FRAMES_OF_ROOM = 128
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,14 @@ class Member:
         start_reporter(self.recorder, self.scene, first_node)
 
     def write(self, frame: Frame) -> bool:
-        """Records a frame; returns whether it was the last of the scene."""
+        """Records a frame; returns whether it was the last of the scene.
+
+        Raises:
+            OSError: the disk is all but full; what was recorded before still fits.
+        """
+        needed = _LEAST_ROOM + _FRAMES_OF_ROOM * (frame.positions.nbytes + frame.directors.nbytes)
+        if shutil.disk_usage(self.directory).free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.directory))
         self.recorder.write(frame)
         return self.recorder.frame_count == self.scene.frames + 1
 

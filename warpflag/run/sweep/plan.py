@@ -187,7 +187,7 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
         key, sign, text = argument.partition("=")
         parts = text.split(":")
         try:
-            if not sign or not key:
+            if not sign or not key or len(parts) not in (1, 3):
                 raise ValueError
             if len(parts) == 3:
                 table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
