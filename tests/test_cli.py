@@ -261,6 +261,19 @@ def test_check_prints_a_scene_and_what_it_requires(scene, capsys):
     assert os.listdir() != [] and not Path("runs").exists()
 
 
+def test_a_run_after_compile_compiles_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few_kernels = 'flagella.count = 1\nhydrodynamics.mode = "none"\nbody.contact = false\nnumerics.stepper = "rkc"\n'
+    Path("bare.toml").write_text(SMALL + few_kernels)
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = command("compile", "bare.toml", env=environment)
+    assert ended.returncode == 0 and "small: kernels are compiled" in ended.stdout, ended.stderr
+    built = set((tmp_path / "cache").glob("**/*.o"))
+    assert len(built) > 5
+    assert command("run", "bare.toml", "--quiet", env=environment).returncode == 0
+    assert set((tmp_path / "cache").glob("**/*.o")) == built
+
+
 def test_devices_lists_the_cpu(capsys):
     assert cli.main(["devices"]) == 0
     assert any(line.split()[0] == "cpu" for line in capsys.readouterr().out.splitlines())

@@ -168,6 +168,15 @@ def _parser() -> argparse.ArgumentParser:
             "--slow-down", type=float, metavar="X", help="times slower than the cell (default: a frame per frame)"
         )
 
+    build = commands.add_parser(
+        "compile",
+        help="compile the kernels that scenes need",
+        description="Fills Warp's kernel cache (WARP_CACHE_PATH) for scenes, so that no run has to wait for it.",
+    )
+    build.add_argument("scenes", nargs="*", metavar="SCENE.toml", help="default: a scene of defaults")
+    build.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
+    build.set_defaults(command=_compile)
+
     devices = commands.add_parser("devices", help="list the devices of this machine")
     devices.set_defaults(command=_devices)
     return parser
@@ -243,6 +252,18 @@ def _check(options: argparse.Namespace) -> int:
         print(report(scene, options.device), end="")
     except NumericalError as error:
         return _say(f"{scene.name}: {error}", STOPPED)
+    return DONE
+
+
+def _compile(options: argparse.Namespace) -> int:
+    from warpflag.run.simulation import Simulation
+    from warpflag.scene import Scene, load
+
+    for scene in [load(path) for path in options.scenes] or [Scene(name="defaults")]:
+        simulation = Simulation(scene, device=options.device)
+        simulation.prepare()
+        next(simulation.cell_frames())  # and the kernels that measure a frame
+        print(f"{scene.name}: kernels are compiled")
     return DONE
 
 
