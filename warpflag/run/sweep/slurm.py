@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import shlex
 import signal
 import subprocess
@@ -164,9 +166,10 @@ class Share:
         """Called by submitit shortly before the end of the wall time: what is to be queued again."""
         import submitit
 
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-            self._process.wait()
+        # Called from a signal handler while `__call__` waits: the process is watched past Popen, whose lock it holds.
+        with contextlib.suppress(ProcessLookupError, ChildProcessError):
+            os.kill(self._process.pid, signal.SIGTERM)
+            os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
         return submitit.helpers.DelayedSubmission(Share(self.command))
 
 
