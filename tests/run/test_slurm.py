@@ -112,7 +112,7 @@ def test_the_dask_recipe_runs_a_sweep(started, tmp_path):
 def test_the_snakemake_recipe_runs_a_sweep(started, tmp_path):
     pytest.importorskip("snakemake")
     directory = in_runs(started, tmp_path)
-    (tmp_path / "Snakefile").write_text(recipe("", "rule all"))
+    (tmp_path / "Snakefile").write_text(recipe("python", "rule all"))
     path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
     environment = {"PATH": path, "HOME": str(Path.home()), "PYTHONPATH": ":".join(sys.path)}
     command = [sys.executable, "-m", "snakemake", "--cores", "2", "--quiet"]

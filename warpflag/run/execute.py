@@ -99,8 +99,8 @@ class Run:
             stop.check()
 
         try:
-            self._prepare(quiet)
-            stop.at_once = False
+            stop.check()
+            self._prepare(quiet, stop)
             look()
             for cell, member in enumerate(self.members):
                 self._guarded(cell, lambda c=cell, m=member: m.start(self._first_node(c)))
@@ -113,14 +113,19 @@ class Run:
         if ended is not None:
             self._end(ended)
 
-    def _prepare(self, quiet: bool) -> None:
+    def _prepare(self, quiet: bool, stop: Stop) -> None:
         said = "warpflag: compiling kernels, once on each machine\n"
         timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, sys.stderr.write, [said])
         if not quiet:
             timer.start()
+        stop.at_once = True
         try:
             self.simulation.prepare()
+        except Exception:
+            stop.check()  # what a signal raises amid other code may come out as another error
+            raise
         finally:
+            stop.at_once = False
             timer.cancel()
 
     def _record(self, look: Callable[[], None]) -> None:

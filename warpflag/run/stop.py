@@ -32,14 +32,15 @@ class Stop:
         max_wall: wall time from now on after which the run is to end [s]; None: no limit.
 
     Attributes:
-        at_once: whether a signal ends the block wherever it is, while nothing is being written.
+        at_once: whether a signal raises Ended wherever the program is: while it compiles, for instance. Not while
+            modules are imported or files written, which would be left half done.
     """
 
     def __init__(self, max_wall: float | None = None) -> None:
         self._deadline = None if max_wall is None else monotonic() + max_wall
         self._asked: Ended | None = None
         self._handlers: dict[int, Any] = {}
-        self.at_once = True
+        self.at_once = False
 
     def __enter__(self) -> Stop:
         if threading.current_thread() is threading.main_thread():

@@ -139,7 +139,6 @@ class SweepRun:
         ended: Ended | None = None
         with Pool([devices[k % len(devices)] for k in range(count)], options) as pool:
             try:
-                stop.at_once = False
                 size = self._batch_size(pool, pending, count, quiet, stop)
                 for batch in self._batches(pending, size):
                     pool.submit(batch)
