@@ -226,6 +226,7 @@ def test_a_finished_run_can_be_prolonged(tmp_path):
         ("motor.torque=2", "no other change than duration"),
         ("duration=4e-5", "where the run stands"),
         ("duration=8.5e-5", "multiple of the frame interval"),
+        ("duration=8.05e-5", "multiple of the frame interval"),
         ("duration=-1", "must be a number"),
         ("duration", "key=value"),
     ],

@@ -129,6 +129,12 @@ def test_reporters_are_closed_when_a_guard_is_violated():
     assert listener.heard[-1] == "close"
 
 
+@pytest.mark.parametrize("duration", [float("nan"), -1e-3, float("inf")])
+def test_a_run_takes_a_time_from_zero_on(duration):
+    with pytest.raises(ValueError, match="a time from 0 on"):
+        Simulation(small(), device="cpu").run(duration)
+
+
 def test_a_batch_has_no_reporters_but_runs():
     batch = [small(), small({"motor.torque": 2.0})]
     with pytest.raises(ValueError, match="single scene"):

@@ -1,4 +1,4 @@
-"""Checkpoints: the state a run continues from, in small files apart from the record.
+"""Checkpoints: the state that a run continues from, in small files apart from the record.
 
 A checkpoint appears under its name only when it is whole on the disk (temporary name, fsync, os.replace), and
 the one before it is kept: where the newest turns out damaged, the older one is loaded.

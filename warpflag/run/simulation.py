@@ -108,7 +108,13 @@ class Simulation:
         """Advances by a simulated time [s], by default to the end of the scene, and hands frames to the reporters.
 
         Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state.
+
+        Raises:
+            NumericalError: a guard was violated.
+            ValueError: the duration is negative or not finite.
         """
+        if duration is not None and not 0.0 <= duration < float("inf"):
+            raise ValueError(f"a run takes a time from 0 on, not {duration}")
         until = self.scenes[0].duration if duration is None else float(self.times[0]) + duration
         reporters, self.reporters = self.reporters, []
         try:
