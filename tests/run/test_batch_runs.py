@@ -179,11 +179,11 @@ def test_speeds_of_many_cells_are_those_of_each():
     np.testing.assert_allclose(speeds, each, rtol=1e-13)
 
 
-def test_a_cell_left_behind_stays_where_it_is():
+def test_an_excluded_cell_stays_where_it_is():
     batch = Simulation([small(), small({"motor.torque": 1.0})], device="cpu")
     frames = batch.cell_frames()
     next(frames), next(frames)
-    batch.leave_behind(0)
+    batch.exclude(0)
     assert all(set(frame) == {1} for frame in frames)
     assert batch.times[0] == pytest.approx(1e-5) and batch.times[1] == pytest.approx(8e-5)
 

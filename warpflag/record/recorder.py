@@ -60,7 +60,7 @@ class Recorder:
         self._resume_step = resume_step
         self._block_frames, self._keep_open = block_frames, keep_open
         self._file: Any = None
-        self._set_aside = False  # there is a file, closed between two blocks
+        self._between_blocks = False  # there is a file, closed between two blocks
         self._parameters: dict[str, Any] = {}
         self._datasets: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -108,7 +108,7 @@ class Recorder:
         Raises ValueError where its shapes or observables are not those of the record.
         """
         values = _values(frame)
-        if self._file is None and not self._set_aside:
+        if self._file is None and not self._between_blocks:
             self._create(values)
         shapes = {name: value.shape for name, value in values.items()}
         if shapes != self._shapes:
@@ -137,22 +137,22 @@ class Recorder:
         self._pending = []
         self._last_commit = time.monotonic()
         if not self._keep_open:
-            self._put_aside()
+            self._close_file()
 
     def close(self) -> None:
         """Commits what is pending and closes the file; calling it again does nothing."""
         try:
             self.flush()
         finally:
-            self._put_aside()
-            self._set_aside = False
+            self._close_file()
+            self._between_blocks = False
 
-    def _put_aside(self) -> None:
+    def _close_file(self) -> None:
         """Closes the file; `flush` opens it again."""
         if self._file is not None:
             self._datasets = {}
             self._file.close()
-            self._file, self._set_aside = None, True
+            self._file, self._between_blocks = None, True
 
     def _open(self, names: list[str]) -> Any:
         """Opens the file that is there for writing, and returns it."""
@@ -212,7 +212,7 @@ class Recorder:
         self._file.flush()
         self._last_commit = time.monotonic()
         if not self._keep_open:
-            self._put_aside()
+            self._close_file()
 
     def _write_parameters(self, file: Any) -> None:
         group = file.create_group("parameters")

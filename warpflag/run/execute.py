@@ -147,7 +147,7 @@ class Run:
                 if given is None:
                     interval = max(_CHECKPOINT_SECONDS, (saved - began) / _CHECKPOINT_SHARE)
             look()
-        # What the loop has not seen: cells whose start a guard refuses, and runs that were resumed at their end.
+        # Cells whose start violates a guard, and runs that were resumed at their end, have had no frame above.
         self._copy = self.simulation.checkpoint()
         faults = self.simulation.faults
         self._stop(faults)
@@ -171,7 +171,7 @@ class Run:
             if isinstance(error, RecordError) and len(self.members) == 1:
                 raise
             member.fail(error)
-            self.simulation.leave_behind(cell)
+            self.simulation.exclude(cell)
             return None
 
     def _stop(self, faults: Mapping[int, NumericalError]) -> None:

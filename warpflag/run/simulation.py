@@ -87,7 +87,7 @@ class Simulation:
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
         self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
         self._reader = CellsReader(self.system, self._energy, self._steric)
-        self._left_behind = np.zeros(len(self.scenes), dtype=bool)
+        self._excluded = np.zeros(len(self.scenes), dtype=bool)
 
     @property
     def times(self) -> np.ndarray:
@@ -150,14 +150,14 @@ class Simulation:
     ) -> Iterator[dict[int, Frame]]:
         """Advances every cell from frame to frame, each at multiples of its own scene's duration / frames.
 
-        A cell that violates a guard, and one that was left behind, has no further frames; the others go on.
+        A cell that violates a guard, and one that was excluded, has no further frames; the others go on.
 
         Args:
             until: simulated time that no frame is beyond [s]; default: the end of each scene.
             watch: as in `advance`.
 
-        Yields:
-            The next frame of each cell that has one, by cell.
+        Returns:
+            An iterator over the next frame of each cell that has one, by cell.
         """
         durations, counts = (
             np.array([getattr(scene, name) for scene in self.scenes]) for name in ("duration", "frames")
@@ -169,7 +169,7 @@ class Simulation:
         last = np.floor((durations if until is None else until) / durations * counts + _ROUNDING)
         while True:
             k = np.floor(self.times / durations * counts + _ROUNDING)
-            waiting = (k < last) & ~self._left_behind & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
+            waiting = (k < last) & ~self._excluded & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
             if not waiting.any():
                 return
             self._advance(np.where(waiting, durations * (k + 1) / counts, 0.0), watch)
@@ -177,9 +177,9 @@ class Simulation:
             reached = waiting & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
             yield frames_of(self._framed, before, lengths, np.flatnonzero(reached))
 
-    def leave_behind(self, cell: int) -> None:
+    def exclude(self, cell: int) -> None:
         """Advances a cell no further: `cell_frames` goes on with the others."""
-        self._left_behind[cell] = True
+        self._excluded[cell] = True
 
     def prepare(self) -> None:
         """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
