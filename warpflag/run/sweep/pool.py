@@ -108,7 +108,7 @@ class Pool:
         self._finished: queue.Queue[tuple[Batch, list[Outcome]]] = queue.Queue()
         self._open, self._done_time, self._ending = 0, 0.0, ""
         self._workers: list[_Worker] = []
-        self._word = threading.Event()
+        self._batch_ended = threading.Event()
 
     def __enter__(self) -> Pool:
         self._workers = [_Worker(device) for device in self.devices]
@@ -162,8 +162,8 @@ class Pool:
 
     def wait(self) -> None:
         """Waits for a moment, or until a batch has ended."""
-        self._word.wait(_SECONDS_PER_LOOK)
-        self._word.clear()
+        self._batch_ended.wait(_SECONDS_PER_LOOK)
+        self._batch_ended.clear()
 
     def end(self, status: str) -> None:
         """Ends all workers resumable.
@@ -199,4 +199,4 @@ class Pool:
                 outcomes = [[self._ending, ""]] * len(batch.members)
             worker.reached = 0.0
             self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes]))
-            self._word.set()
+            self._batch_ended.set()

@@ -29,7 +29,7 @@ from warpflag.scene import Scene, loads
 
 __all__ = ["main"]
 
-_SECONDS_PER_WORD = 0.2
+_SECONDS_PER_REPORT = 0.2
 _SAMPLE_SECONDS = 0.3
 _FIRST_PART = 64  # of the simulated time is what is timed first
 
@@ -67,12 +67,12 @@ def _run(request: dict[str, Any], answers: TextIO, stop: Stop) -> dict[str, Any]
     """Runs a batch; where it can't begin together, each member by itself."""
     directories = [Path(directory) for directory in request["directories"]]
     scenes = [loads(text) for text in request["scenes"]]
-    said = monotonic()
+    reported = monotonic()
 
     def watch(reached: float) -> None:
-        nonlocal said
-        if monotonic() - said > _SECONDS_PER_WORD:
-            said = monotonic()
+        nonlocal reported
+        if monotonic() - reported > _SECONDS_PER_REPORT:
+            reported = monotonic()
             _answer(answers, {"reached": reached})
 
     def ended(batch: slice) -> list[Outcome]:
