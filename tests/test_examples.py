@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,8 @@ from warpflag.run import run, sweep
 from warpflag.scene import load, with_values
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-FILES = sorted(EXAMPLES.glob("*.toml"))
-SWEEPS = [path for path in FILES if "base" in tomllib.loads(path.read_text())]
-SCENES = [path for path in FILES if path not in SWEEPS]
+SCENES = sorted(EXAMPLES.glob("*.toml"))
+SWEEPS = sorted(EXAMPLES.glob("sweeps/*.toml"))
 
 
 def few_steps(path: Path, directory: Path) -> Path:
