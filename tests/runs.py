@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from warpflag.record import Record
 from warpflag.run import run
-from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
 
 
@@ -29,16 +28,15 @@ def summary(directory: Path) -> dict:
     return json.loads((directory / "summary.json").read_text())
 
 
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, frame: int) -> None:
-    """Ctrl-C while the steps toward a frame are taken."""
-    advance = Simulation.advance
+def ended_at(started: run.Run, frame: int, number: int = signal.SIGINT) -> run.Outcome:
+    """How a run ends that gets a signal once it has advanced to a frame, which is not recorded yet."""
+    scene = started.simulation.scenes[0]
 
-    def interrupted(self, until, watch=None):
-        advance(self, until, watch)
-        if round(until / self.scenes[0].duration * self.scenes[0].frames) == frame:
-            raise KeyboardInterrupt
+    def watch(reached: float) -> None:
+        if reached > scene.duration * (frame - 0.5) / scene.frames:
+            signal.raise_signal(number)
 
-    monkeypatch.setattr(Simulation, "advance", interrupted)
+    return started.execute_all(quiet=True, watch=watch)[0]
 
 
 def arrays(directory: Path) -> dict[str, np.ndarray]:

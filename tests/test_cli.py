@@ -134,6 +134,15 @@ def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypa
         (["export", "nowhere", "--to", "usd"], ["nowhere", "no such record"]),
         (["export", "nowhere", "--to", "gif"], ["gif", "usd"]),
         (["export", "nowhere", "--to", "usd", "-o", "movie.mp4"], ["nowhere", "no such record"]),
+        (["run", "small.toml", "--resume-or-start"], ["--resume-or-start", "-o"]),
+        (["run", "small.toml", "--max-wall", "1 h"], ["--max-wall", "is no time"]),
+        (["sweep"], ["SWEEP.toml", "--resume"]),
+        (["sweep", "--resume", "nowhere"], ["nowhere", "no sweep"]),
+        (["sweep", "--resume", "nowhere", "--grid", "motor.torque=1:2:3"], ["--grid"]),
+        (["sweep", "small.toml", "--grid", "motor.torque=1:2"], ["--grid", "from:to:count"]),
+        (["sweep", "small.toml", "--share", "2/2"], ["2/2"]),
+        (["sweep", "small.toml", "--workers", "0"], ["0", "whole number"]),
+        (["plot", "small.toml", "-o", "x.png", "--y", "steps"], ["small.toml", "is no sweep"]),
         (["swim"], ["swim", "run"]),
     ],
 )
@@ -147,6 +156,65 @@ def test_bad_input_of_a_real_process(scene):
     ended = command("run", scene, "--set", "motor.torque=much")
     assert (ended.returncode, ended.stdout) == (2, "")
     assert ended.stderr.count("\n") == 1 and "motor.torque" in ended.stderr
+
+
+@pytest.mark.skipif(not os.access("/sys", os.R_OK), reason="needs a file system that takes no directories")
+def test_a_directory_that_the_machine_refuses_is_one_line(scene, capsys):
+    assert cli.main(["run", scene, "-o", "/sys/made"]) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "/sys/made: " in said.err
+
+
+def test_the_progress_ends_with_its_end(scene):
+    ended = command("run", scene)
+    assert ended.stderr.splitlines()[-1].startswith("100 %  0.04 / 0.04 ms")
+
+
+def test_precision_wins_over_set(scene):
+    assert cli.main(["run", scene, "--precision", "float32", "--set", "numerics.precision=float64", "--quiet"]) == 0
+    assert load("runs/small/scene.toml").numerics.precision == "float32"
+
+
+def test_the_wall_time_ends_a_run_with_its_own_status(scene, capsys):
+    assert cli.main(["run", scene, "-o", "made", "--max-wall", "0", "--set", "duration=1.0", "frames=100000"]) == 143
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "wall time" in line and "--resume made" in line
+
+
+def test_resuming_a_finished_run_says_so(scene, capsys):
+    assert cli.main(["run", scene, "-o", "made", "--quiet"]) == 0
+    assert cli.main(["run", "--resume", "made"]) == 0
+    assert "done already" in capsys.readouterr().out
+
+
+def test_a_sweep_from_the_command_line(scene, capsys):
+    arguments = ["--grid", "motor.torque=1:3:2", "-o", "out", "--workers", "1", "--set", "frames=2", "--quiet"]
+    assert cli.main(["sweep", scene, *arguments]) == 0
+    assert [load(f"out/000{k}/scene.toml").motor.torque for k in range(2)] == [1.0, 3.0]
+    assert cli.main(["sweep", "--resume", "out", "--quiet"]) == 0
+    line = refused(capsys, "sweep", scene, *arguments)
+    assert "--resume out" in line
+    assert cli.main(["sweep", scene, *arguments, "--resume-or-start"]) == 0
+    assert "another sweep" in refused(capsys, "sweep", scene, "-o", "out", "--resume-or-start")
+
+
+def test_bad_members_are_a_line_each_and_nothing_is_made(scene, capsys):
+    assert cli.main(["sweep", scene, "--grid", "motor.torque=1,5000,x"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and all(line.startswith("warpflag: member 000") for line in lines), lines
+    assert os.listdir() == [scene]
+
+
+def test_a_script_for_slurm_names_every_share(scene, capsys):
+    arguments = ["--grid", "motor.torque=1:3:4", "-o", "out", "--slurm-script", "--jobs", "3", "--time", "1:30:00"]
+    assert cli.main(["sweep", scene, *arguments, "--slurm-set", "partition=long"]) == 0
+    script = capsys.readouterr().out
+    assert script.startswith("#!/bin/bash\n") and "#SBATCH --array=0-2\n" in script
+    for option in ("time=01:30:00", "signal=B:USR1@120", "partition=long", "requeue"):
+        assert f"#SBATCH --{option}\n" in script
+    assert f'--resume {Path("out").resolve()} --share "$SLURM_ARRAY_TASK_ID/3"' in script
+    checked = subprocess.run(["bash", "-n"], input=script, text=True, capture_output=True)
+    assert checked.returncode == 0, checked.stderr
 
 
 def test_a_run_says_where_it_wrote_and_nothing_of_warp(scene):
@@ -191,6 +259,19 @@ def test_check_prints_a_scene_and_what_it_requires(scene, capsys):
     bare = capsys.readouterr().out
     assert "steric," not in bare and "pair sum" not in bare
     assert os.listdir() != [] and not Path("runs").exists()
+
+
+def test_a_run_after_compile_compiles_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    few_kernels = 'flagella.count = 1\nhydrodynamics.mode = "none"\nbody.contact = false\nnumerics.stepper = "rkc"\n'
+    Path("bare.toml").write_text(SMALL + few_kernels)
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = command("compile", "bare.toml", env=environment)
+    assert ended.returncode == 0 and "small: kernels are compiled" in ended.stdout, ended.stderr
+    built = set((tmp_path / "cache").glob("**/*.o"))
+    assert len(built) > 5
+    assert command("run", "bare.toml", "--quiet", env=environment).returncode == 0
+    assert set((tmp_path / "cache").glob("**/*.o")) == built
 
 
 def test_devices_lists_the_cpu(capsys):

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from warpflag.record import Record
-from warpflag.run import run
+from warpflag.run import run, sweep
 from warpflag.scene import load, with_values
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SCENES = sorted(EXAMPLES.glob("*.toml"))
+SWEEPS = sorted(EXAMPLES.glob("sweeps/*.toml"))
 
 
 def few_steps(path: Path, directory: Path) -> Path:
@@ -38,6 +39,17 @@ def test_scene_runs(path, tmp_path):
         assert (record.motor_angle[-1] * [spec.torque for spec in flagella] > 0).all()
         moved = np.linalg.norm(record.body_position[-1] - record.body_position[0])
         assert (moved == 0) == load(path).body.anchored
+
+
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
+def test_sweep_runs(path, tmp_path):
+    """Its first and last members, for a moment."""
+    plan = sweep.read(path, ["duration=2e-5", "frames=2"])
+    members = plan.members()
+    assert len(members) >= 8
+    for member in (members[0], members[-1]):
+        outcome = run.start(member.scene, str(tmp_path / member.scene.name), "cpu", movies=False).execute(quiet=True)
+        assert outcome.status == "done", outcome.message
 
 
 def script(name: str, *arguments: str, cwd: Path) -> str:

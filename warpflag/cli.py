@@ -1,6 +1,7 @@
-"""The command line: `warpflag run`, `check`, `plot`, `render`, `export`, `devices`.
+"""The command line: `warpflag run`, `sweep`, `check`, `plot`, `render`, `export`, `compile`, `devices`.
 
-Exit status: 0 done; 2 bad input, told in one line; 3 a guard stopped the run; 130 interrupted, resumable. Everything
+Exit status: 0 done; 1 the machine failed the run (disk full, no permission); 2 bad input, told in one line; 3 a guard
+stopped the run; 130 interrupted by Ctrl-C, 143 terminated by a signal or out of wall time, both resumable. Everything
 heavy is imported by the command that needs it.
 """
 
@@ -11,16 +12,18 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from warpflag import __version__
+from warpflag import __version__, sweep_command
 from warpflag.base.streams import protected_streams
 
 if TYPE_CHECKING:
+    from warpflag.run.run import Outcome, Run
     from warpflag.scene import Scene
     from warpflag.view.usd import Shot
 
 __all__ = ["main"]
 
-DONE, FAILED, BAD_INPUT, STOPPED, INTERRUPTED = 0, 1, 2, 3, 130
+DONE, FAILED, BAD_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 130, 143
+_STATUS = {"done": DONE, "failed": FAILED, "stopped": STOPPED, "interrupted": INTERRUPTED, "terminated": TERMINATED}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -36,12 +39,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.command(options)
-    except _bad_input() as error:
-        return _say(_located(error, options), BAD_INPUT)
+    except KeyboardInterrupt as error:
+        status, reason = getattr(error, "status", "interrupted"), getattr(error, "reason", "")
+        return _say(status + (f" ({reason})" if reason else ""), _STATUS[status])
+    except _bad_input() as error:  # after the interrupt, which may have come while these were being imported
+        return _say(str(_located(error, options)).replace("\n", "\nwarpflag: "), BAD_INPUT)
     except OSError as error:
-        return _say(error, FAILED)
-    except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+        return _say(f"{error.filename}: {error.strerror}" if error.filename else error, FAILED)
 
 
 def _say(message: object, status: int) -> int:
@@ -54,10 +58,13 @@ def _bad_input() -> tuple[type[Exception], ...]:
     from warpflag.base.output import OutputError
     from warpflag.record import RecordError
     from warpflag.run.checkpoint import CheckpointError
+    from warpflag.run.lock import LockedError
     from warpflag.run.run_directory import RunError
+    from warpflag.run.sweep import BadMembers
     from warpflag.scene import SceneError
 
-    return CheckpointError, DeviceError, OutputError, RecordError, RunError, SceneError
+    found = (BadMembers, CheckpointError, DeviceError, LockedError, OutputError, RecordError, RunError, SceneError)
+    return (*found, sweep_command.OptionError)
 
 
 def _located(error: Exception, options: argparse.Namespace) -> Exception:
@@ -79,8 +86,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("scene", nargs="?", metavar="SCENE.toml", help="the scene to run")
     run.add_argument("--resume", metavar="DIR", help="continue the run in DIR; of --set it takes duration only")
     run.add_argument("-o", dest="output", metavar="DIR", help="run directory (default: runs/NAME, never overwritten)")
+    run.add_argument("--resume-or-start", action="store_true", help="continue the run in -o DIR, or start it there")
     run.add_argument("--quiet", action="store_true", help="print errors only")
+    _add_limits(run)
     run.set_defaults(command=_run)
+
+    sweep_command.add(commands, _add_limits).set_defaults(command=_sweep)
 
     check = commands.add_parser(
         "check",
@@ -99,18 +110,22 @@ def _parser() -> argparse.ArgumentParser:
 
     plot = commands.add_parser(
         "plot",
-        help="draw the curves of runs",
+        help="draw the curves of runs, or the numbers of a sweep",
         description="Draws what was measured on a run over time, or compares several runs in phase difference, bundle "
         "length and contact force; needs matplotlib, the extra plot. Runs are labelled by what differs between their "
-        "scenes. The bundle length passes over gaps of 1 um; run.h5 has the plain one.",
+        "scenes. The bundle length passes over gaps of 1 um; run.h5 has the plain one. Of a sweep it draws numbers of "
+        "its table against an axis, or maps over two.",
     )
-    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory")
+    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory, or the directory of one sweep")
+    plot.add_argument("--x", metavar="COLUMN", help="of a sweep: draw against this column (default: its first axis)")
+    plot.add_argument("--y", nargs="+", default=[], metavar="COLUMN", help="of a sweep: numbers of its table to draw")
     plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
     plot.add_argument(
         "--as",
         dest="kind",
-        choices=("dashboard", "comparison"),
-        help="all curves of one run, or several runs in the same panels (default: by the number of DIR)",
+        choices=("dashboard", "comparison", "curves", "map"),
+        help="all curves of one run, or several runs in the same panels (default: by the number of DIR); of a sweep "
+        "curves or a map (default: map of two axes)",
     )
     plot.set_defaults(command=_plot)
 
@@ -159,9 +174,28 @@ def _parser() -> argparse.ArgumentParser:
             "--slow-down", type=float, metavar="X", help="times slower than the cell (default: a frame per frame)"
         )
 
+    build = commands.add_parser(
+        "compile",
+        help="compile the kernels that scenes need",
+        description="Fills Warp's kernel cache (WARP_CACHE_PATH) for scenes, so that no run has to wait for it.",
+    )
+    build.add_argument("scenes", nargs="*", metavar="SCENE.toml", help="default: a scene of defaults")
+    build.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
+    build.set_defaults(command=_compile)
+
     devices = commands.add_parser("devices", help="list the devices of this machine")
     devices.set_defaults(command=_devices)
     return parser
+
+
+def _add_limits(command: argparse.ArgumentParser) -> None:
+    """What limits the wall time of a command that runs scenes."""
+    command.add_argument(
+        "--max-wall", type=_wall_time, metavar="TIME", help="end resumable after [[D-]HH:]MM:SS or seconds, status 143"
+    )
+    command.add_argument(
+        "--checkpoint-interval", type=_wall_time, metavar="TIME", help="wall time between checkpoints (default: 5)"
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -171,17 +205,46 @@ def _run(options: argparse.Namespace) -> int:
         return _say("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
     if options.resume is not None and (options.output or options.precision):
         return _say("--resume goes on in its directory and precision; leave out -o and --precision", BAD_INPUT)
-    from warpflag.run import run
+    if options.resume_or_start and not (options.scene and options.output):
+        return _say("--resume-or-start needs a SCENE.toml and -o DIR", BAD_INPUT)
+    from warpflag.run.stop import Stop
 
-    if options.resume is not None:
-        outcome = run.resume(options.resume, options.set, options.device).execute(options.quiet)
-    else:
-        outcome = run.start(_scene(options), options.output, options.device).execute(options.quiet)
+    with Stop(options.max_wall) as stop:
+        return _told(_started(options).execute(options.quiet, stop), options)
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    outcome = sweep_command.sweep(options)
+    if not isinstance(outcome, str):
+        return _told(outcome, options)
+    print(outcome)
+    return DONE
+
+
+def _told(outcome: Outcome, options: argparse.Namespace) -> int:
+    """Says how runs have ended; returns the exit status."""
     if outcome.status != "done":
-        return _say(outcome.message, {"stopped": STOPPED, "interrupted": INTERRUPTED}[outcome.status])
+        return _say(outcome.message, _STATUS[outcome.status])
     if not options.quiet:
         print(outcome.message)
     return DONE
+
+
+def _started(options: argparse.Namespace) -> Run:
+    """The run that `warpflag run` was asked for."""
+    from pathlib import Path
+
+    from warpflag.run import run
+    from warpflag.run.run_directory import SCENE_NAME, check_same_scene
+
+    limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
+    if options.resume is not None:
+        return run.resume(options.resume, options.set, options.device, **limits)
+    scene = _scene(options)
+    if options.resume_or_start and (Path(options.output) / SCENE_NAME).exists():
+        check_same_scene(Path(options.output), scene)
+        return run.resume(options.output, device=options.device, **limits)
+    return run.start(scene, options.output, options.device, **limits)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -195,6 +258,18 @@ def _check(options: argparse.Namespace) -> int:
         print(report(scene, options.device), end="")
     except NumericalError as error:
         return _say(f"{scene.name}: {error}", STOPPED)
+    return DONE
+
+
+def _compile(options: argparse.Namespace) -> int:
+    from warpflag.run.simulation import Simulation
+    from warpflag.scene import Scene, load
+
+    for scene in [load(path) for path in options.scenes] or [Scene(name="defaults")]:
+        simulation = Simulation(scene, device=options.device)
+        simulation.prepare()
+        next(simulation.cell_frames())  # and the kernels that measure a frame
+        print(f"{scene.name}: kernels are compiled")
     return DONE
 
 
@@ -214,8 +289,14 @@ def _scene(options: argparse.Namespace) -> Scene:
 
 
 def _plot(options: argparse.Namespace) -> int:
-    from warpflag.view import figures
+    from warpflag.view import figures, sweep_figures
 
+    if sweep_figures.is_sweep(options.directories[0]):
+        figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
+        print(options.output)
+        return DONE
+    if options.x or options.y or options.kind in ("curves", "map"):
+        return _say(f"{options.directories[0]}: is no sweep, which --x, --y, curves and map are for", BAD_INPUT)
     runs = [figures.read(directory) for directory in options.directories]
     compared = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
     if len(runs) > 1 and not compared:
@@ -293,6 +374,15 @@ def _size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal()):
         raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
     return int(width), int(height)
+
+
+def _wall_time(text: str) -> float:
+    from warpflag.run.stop import wall_seconds
+
+    try:
+        return wall_seconds(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _devices(options: argparse.Namespace) -> int:

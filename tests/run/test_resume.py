@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,62 +14,146 @@ import numpy as np
 import pytest
 
 import warpflag
-from tests.runs import arrays, assert_same_frames, executed, interrupt_at, small, summary
+from tests.runs import arrays, assert_same_frames, ended_at, executed, small, summary
 from warpflag.record import Record, RecordError
-from warpflag.run import run
+from warpflag.run import member, run
 from warpflag.run.checkpoint import CheckpointError
 from warpflag.run.run_directory import RunError
-from warpflag.run.simulation import Simulation
+from warpflag.run.stop import Stop, wall_seconds
 from warpflag.scene import SceneError, dumps, load
 
 
-@pytest.mark.parametrize("stop", [1, 5, 8])
-def test_an_interrupted_run_resumes_to_the_same_record(stop, tmp_path, monkeypatch):
-    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
-    with monkeypatch.context() as patch:
-        interrupt_at(patch, stop)
-        outcome = run.start(small(), str(halved), "cpu").execute(quiet=True)
+@pytest.mark.parametrize("stop", [1, 9, 16])
+def test_an_interrupted_run_resumes_to_the_same_record(stop, tmp_path):
+    # Long enough that the steps depend on all that the stepper remembers, and some are refused.
+    scene = small({"flagella.count": 3, "flagella.length": 3.0, "duration": 1.6e-3, "frames": 16})
+    whole, halved = executed(scene, tmp_path / "whole"), tmp_path / "halved"
+    outcome = ended_at(run.start(scene, str(halved), "cpu", checkpoint_seconds=0.0), stop)
     assert outcome.status == "interrupted" and f"--resume {halved}" in outcome.message
+    assert "movie left out" in outcome.message and not (halved / "movie.usdc").exists()
     with Record(halved) as record:
         assert record.frame_count == stop
     assert (summary(halved)["status"], summary(halved)["frames"]) == ("interrupted", stop)
-    wall_time = summary(halved)["wall_time"]
+    resumed = run.resume(str(halved))
+    assert resumed.simulation.times[0] == pytest.approx((stop - 1) * 1e-4, abs=1e-12)
+    assert resumed.execute(quiet=True).status == "done"
+    assert_same_frames(whole, halved)
+    for name in ("steps", "evaluations", "rejected_steps"):
+        assert summary(halved)[name] == summary(whole)[name]
+    assert (halved / "movie.usdc").exists()
+
+
+def test_wall_time_counts_on_when_a_run_is_resumed(tmp_path, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(member, "monotonic", lambda: now[0])
+    halved = run.start(small(), str(tmp_path / "halved"), "cpu")
+    now[0] += 30.0
+    ended_at(halved, 5)
+    assert summary(tmp_path / "halved")["wall_time"] == 30.0
+    now[0] += 5000.0
+    resumed = run.resume(str(tmp_path / "halved"))
+    now[0] += 12.0
+    resumed.execute(quiet=True)
+    assert summary(tmp_path / "halved")["wall_time"] == 42.0
+
+
+def test_resume_goes_back_to_the_last_checkpoint(tmp_path):
+    """Frames beyond the checkpoint are computed again."""
+    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
+    ended_at(run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0), 7)
+    max(halved.glob("checkpoint-*")).unlink()
+    before = run.resume(str(halved))
+    assert before.simulation.times[0] == pytest.approx(5e-5)
+    assert before.execute(quiet=True).status == "done"
+    assert_same_frames(whole, halved)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGXCPU])
+def test_signals_that_terminate_leave_a_resumable_run(number, tmp_path):
+    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
+    outcome = ended_at(run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0), 4, number)
+    assert outcome.status == "terminated" and signal.Signals(number).name in outcome.message
+    assert summary(halved)["status"] == "terminated"
     assert run.resume(str(halved)).execute(quiet=True).status == "done"
     assert_same_frames(whole, halved)
-    assert summary(halved)["evaluations"] == summary(whole)["evaluations"]
-    assert summary(halved)["wall_time"] > wall_time
 
 
-def test_resume_goes_back_to_the_last_checkpoint(tmp_path, monkeypatch):
-    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "_SECONDS_PER_CHECKPOINT", 0.0)
-        save = run.Run._save
-        saves = []
-
-        def some(self):
-            saves.append(len(saves))
-            if len(saves) <= 3:
-                save(self)
-
-        patch.setattr(run.Run, "_save", some)
-        interrupt_at(patch, 7)
-        run.start(small(), str(halved), "cpu").execute(quiet=True)
-    assert len(saves) == 7
-    resumed = run.resume(str(halved))
-    assert resumed.simulation.times[0] == pytest.approx(2e-5)
-    resumed.execute(quiet=True)
-    assert_same_frames(whole, halved)
+def test_the_wall_time_ends_a_run(tmp_path):
+    scene = small({"duration": 1.0, "frames": 100_000})
+    outcome = run.start(scene, str(tmp_path / "made"), "cpu").execute(quiet=True, stop=Stop(max_wall=0.3))
+    assert outcome.status == "terminated" and "wall time" in outcome.message
+    with Record(tmp_path / "made") as record:
+        assert 1 < record.frame_count < 100_000
+    assert run.resume(str(tmp_path / "made")).simulation.times[0] > 0.0
 
 
-def test_a_run_stopped_before_its_first_frame_starts_again(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "text, seconds", [("90", 90), ("1.5", 1.5), ("2:03", 123), ("1:00:05", 3605), ("2-01:00:00", 176400)]
+)
+def test_wall_times_are_read(text, seconds):
+    assert wall_seconds(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "-5", "1 h", "nan", "1::2", "1:2:3:4"])
+def test_what_is_no_wall_time_is_refused(text):
+    with pytest.raises(ValueError, match="is no time"):
+        wall_seconds(text)
+
+
+def test_a_run_stopped_before_its_first_frame_starts_again(tmp_path):
     whole, late = executed(small(), tmp_path / "whole"), tmp_path / "late"
-    with monkeypatch.context() as patch:
-        patch.setattr(Simulation, "prepare", lambda self: signal.raise_signal(signal.SIGINT))
-        outcome = run.start(small(), str(late), "cpu").execute(quiet=True)
-    assert outcome.status == "interrupted" and f"--resume {late}" in outcome.message
+    outcome = run.start(small(), str(late), "cpu").execute(quiet=True, stop=Stop(max_wall=-1.0))
+    assert outcome.status == "terminated" and f"--resume {late}" in outcome.message
+    assert not (late / "run.h5").exists()
     assert run.resume(str(late), device="cpu").execute(quiet=True).status == "done"
     assert_same_frames(whole, late)
+
+
+def test_a_record_without_any_checkpoint_is_made_again(tmp_path):
+    whole, late = executed(small(), tmp_path / "whole"), tmp_path / "late"
+    ended_at(run.start(small(), str(late), "cpu"), 3)
+    for path in late.glob("checkpoint-*"):
+        path.unlink()
+    assert run.resume(str(late)).execute(quiet=True).status == "done"
+    assert_same_frames(whole, late)
+
+
+def test_a_run_killed_after_its_last_frame_is_completed(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    before = arrays(directory)
+    for name in ("summary.json", "movie.usdc"):
+        (directory / name).unlink()
+    assert run.resume(str(directory)).execute(quiet=True).status == "done"
+    assert (directory / "movie.usdc").exists() and summary(directory)["status"] == "done"
+    for name, values in arrays(directory).items():
+        np.testing.assert_array_equal(values, before[name])
+
+
+def test_a_finished_run_says_that_it_is_done(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    before = (directory / "run.h5").read_bytes()
+    outcome = run.resume(str(directory)).execute(quiet=True)
+    assert outcome.status == "done" and "done already" in outcome.message
+    assert (directory / "run.h5").read_bytes() == before
+
+
+def test_a_full_disk_fails_a_run_in_one_line_and_it_resumes(tmp_path, monkeypatch):
+    whole, halved = executed(small(), tmp_path / "whole"), tmp_path / "halved"
+    usage, calls = shutil.disk_usage(tmp_path), []
+
+    def filling(path):
+        calls.append(path)
+        return usage._replace(free=usage.free if len(calls) <= 5 else 1000)
+
+    monkeypatch.setattr(shutil, "disk_usage", filling)
+    outcome = run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0).execute(quiet=True)
+    assert outcome.status == "failed" and "\n" not in outcome.message
+    assert "No space left" in outcome.message and str(halved) in outcome.message
+    with Record(halved) as record:
+        assert record.frame_count == 5
+    monkeypatch.undo()
+    assert run.resume(str(halved)).execute(quiet=True).status == "done"
+    assert_same_frames(whole, halved)
 
 
 LONG = ["run", "long.toml", "-o", "made", "--quiet", "--device", "cpu"]
@@ -93,11 +178,6 @@ def started_process(directory: Path) -> subprocess.Popen:
                 return process
 
 
-def shortened(directory: Path, frames: int) -> None:
-    """Rewrites the scene of a run to end after some frames, so that resuming it is short."""
-    (directory / "scene.toml").write_text(dumps(small({"duration": frames * 1e-5, "frames": frames})))
-
-
 def test_ctrl_c_leaves_a_readable_resumable_run(tmp_path):
     process = started_process(tmp_path)
     process.send_signal(signal.SIGINT)
@@ -109,19 +189,26 @@ def test_ctrl_c_leaves_a_readable_resumable_run(tmp_path):
         assert summary(tmp_path / "made")["frames"] == record.frame_count
 
 
-def test_a_killed_run_resumes_to_the_same_record(tmp_path):
+def test_a_killed_run_resumes_where_it_was(tmp_path):
     process = started_process(tmp_path)
     process.kill()
     process.communicate()
     with Record(tmp_path / "made") as record:
         kept = record.frame_count
-    shortened(tmp_path / "made", kept + 5)
-    assert run.resume(str(tmp_path / "made")).execute(quiet=True).status == "done"
-    whole = executed(small({"duration": (kept + 5) * 1e-5, "frames": kept + 5}), tmp_path / "whole")
+    until = (kept + 5) * 1e-5
+    resumed = run.resume(str(tmp_path / "made"))
+    resumed.execute_all(quiet=True, watch=lambda reached: raise_signal_beyond(until, reached))
+    whole = executed(small({"duration": until, "frames": kept + 5}), tmp_path / "whole")
     found, expected = arrays(tmp_path / "made"), arrays(whole)
+    assert len(found["times"]) >= kept + 5
     # The times of frames are the scene's duration in parts, and round differently in the longer scene.
     for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(found[name][: kept + 5], values[: kept + 5], rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def raise_signal_beyond(until: float, reached: float) -> None:
+    if reached > until:
+        signal.raise_signal(signal.SIGINT)
 
 
 def test_a_finished_run_can_be_prolonged(tmp_path):
@@ -139,6 +226,7 @@ def test_a_finished_run_can_be_prolonged(tmp_path):
         ("motor.torque=2", "no other change than duration"),
         ("duration=4e-5", "where the run stands"),
         ("duration=8.5e-5", "multiple of the frame interval"),
+        ("duration=8.05e-5", "multiple of the frame interval"),
         ("duration=-1", "must be a number"),
         ("duration", "key=value"),
     ],
@@ -152,10 +240,12 @@ def test_resume_takes_only_a_longer_duration(override, words, tmp_path):
     assert arrays(directory).keys() == before.keys() and load(directory / "scene.toml") == small()
 
 
-def test_resume_needs_a_run_with_a_checkpoint(tmp_path):
+def test_resume_needs_a_run_with_a_sound_checkpoint(tmp_path):
     with pytest.raises(RunError, match=r"scene\.toml"):
         run.resume(str(tmp_path))
-    directory = executed(small(), tmp_path / "made")
+    assert list(tmp_path.iterdir()) == []
+    directory = tmp_path / "made"
+    ended_at(run.start(small(), str(directory), "cpu"), 4)
     for path in directory.glob("checkpoint-*"):
         path.write_bytes(b"")
     with pytest.raises(CheckpointError):

@@ -10,7 +10,6 @@ from tests.runs import arrays, executed, small, summary
 from warpflag import observables
 from warpflag.record import Record
 from warpflag.run import run
-from warpflag.run.simulation import Simulation
 from warpflag.scene import dumps, load
 
 
@@ -64,19 +63,16 @@ def test_a_motor_that_stands_still_in_the_body_turns_with_it_in_the_lab():
     np.testing.assert_allclose(rates, [50.0, 200.0], rtol=1e-12)
 
 
-def test_a_violated_guard_keeps_the_sound_frames(tmp_path, monkeypatch):
+def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
     # Explicit Euler far above its stable step, but only from the fourth frame on.
     scene = small({"numerics.stepper": "euler", "duration": 8e-7, "frames": 8})
     started = run.start(scene, str(tmp_path / "made"), "cpu")
-    advance = Simulation.advance
 
-    def reckless(self, until, watch=None):
-        if until > 3.5e-7:
-            self.system.control.longest_step.fill_(1e-7)
-        advance(self, until, watch)
+    def watch(reached: float) -> None:
+        if reached > 2.5e-7:
+            started.simulation.system.control.longest_step.fill_(1e-7)
 
-    monkeypatch.setattr(Simulation, "advance", reckless)
-    outcome = started.execute(quiet=True)
+    (outcome,) = started.execute_all(quiet=True, watch=watch)
     assert outcome.status == "stopped"
     assert "\n" not in outcome.message and "flagellum" in outcome.message and "numerics.time_step" in outcome.message
     said = summary(tmp_path / "made")
@@ -84,6 +80,5 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path, monkeypatch):
     assert said["message"] in outcome.message
     with Record(tmp_path / "made") as record:
         assert said["frames"] == record.frame_count >= 4
-        monkeypatch.undo()
         sound = executed(scene, tmp_path / "sound")
         np.testing.assert_array_equal(record.positions[:4], arrays(sound)["positions"][:4])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.runs import assert_same_frames, executed, interrupt_at, small
+from tests.runs import assert_same_frames, ended_at, executed, small
 from warpflag.record import Frame, Record
 from warpflag.record.recorder import Recorder
 from warpflag.run import run
@@ -13,7 +13,7 @@ from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import SceneError
 
 STEPPERS = {
-    "rkc": {},
+    "rkc": {"numerics.stepper": "rkc"},
     "euler": {"numerics.stepper": "euler", "duration": 4e-7},
     "implicit": {"numerics.stepper": "implicit"},
     "float32": {"numerics.precision": "float32"},
@@ -80,13 +80,11 @@ def test_a_record_of_another_cell_is_no_start(values, words, tmp_path):
         Simulation(small({"start.record": str(directory), **values}), device="cpu")
 
 
-def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path, monkeypatch):
+def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path):
     origin = executed(small(), tmp_path / "origin")
     scene = small({"start.record": str(origin)})
     whole = executed(scene, tmp_path / "whole")
-    with monkeypatch.context() as patch:
-        interrupt_at(patch, 4)
-        run.start(scene, str(tmp_path / "halved"), "cpu").execute(quiet=True)
+    assert ended_at(run.start(scene, str(tmp_path / "halved"), "cpu"), 4).status == "interrupted"
     (origin / "run.h5").unlink()
     run.resume(str(tmp_path / "halved")).execute(quiet=True)
     assert_same_frames(whole, tmp_path / "halved")
@@ -129,6 +127,12 @@ def test_reporters_are_closed_when_a_guard_is_violated():
     with pytest.raises(NumericalError):
         Simulation(scene, device="cpu", reporters=[listener]).run()
     assert listener.heard[-1] == "close"
+
+
+@pytest.mark.parametrize("duration", [float("nan"), -1e-3, float("inf")])
+def test_a_run_takes_a_time_from_zero_on(duration):
+    with pytest.raises(ValueError, match="a time from 0 on"):
+        Simulation(small(), device="cpu").run(duration)
 
 
 def test_a_batch_has_no_reporters_but_runs():

@@ -16,6 +16,7 @@ from warpflag_kernels.fluid import rotne_prager
 from warpflag_kernels.rod import comoving_chart
 from warpflag_kernels.stepping.terms import terms_named
 
+from warpflag.base import rotations
 from warpflag.model.geometry import InitialState
 from warpflag.model.terms import SCENE_TERMS, switches_of
 from warpflag.scene import Scene, SceneError
@@ -138,7 +139,7 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     positions, tangents, directors = [], [], []
     axes, first_flagellum = model.data.motor.axis.numpy().astype(np.float64), model.data.first_flagellum.numpy()
     for c, start in enumerate(starts):
-        to_lab = _lab_axes(start.body_orientation)
+        to_lab = rotations.matrix(start.body_orientation)
         for k, (nodes, e1) in enumerate(zip(start.positions, start.directors, strict=True)):
             segments = np.diff(nodes, axis=0)
             t = segments / np.linalg.norm(segments, axis=1, keepdims=True)
@@ -161,18 +162,6 @@ def build_control(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     control = clock.allocate(model.cell_count, model.device)
     control.time.assign([start.time for start in starts])
     return control
-
-
-def _lab_axes(q: np.ndarray) -> np.ndarray:
-    """Body axes in the lab as columns, of the orientation quaternion (x, y, z, w), shape [3, 3]."""
-    x, y, z, w = np.asarray(q, dtype=np.float64)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _attachment(scenes: Sequence[Scene], flagella: Sequence[Any], owner: Sequence[int]) -> tuple[Any, Any]:

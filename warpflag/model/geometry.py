@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from warpflag.base import rotations
 from warpflag.observables import local_phase_difference
 from warpflag.scene import FlagellumSpec, Scene, SceneError
 
@@ -81,7 +82,7 @@ def ground_state(strain: tuple[float, float, float], segment_length: float) -> D
     # Half-angle quaternions: |kb| = 2 tan(bend/2), so kb/2 is tan(bend/2) times the bending axis.
     half_binormal = np.array([cos_half * bend_1 - sin_half * bend_2, sin_half * bend_1 + cos_half * bend_2, 0])
     half_binormal /= 2 * cos_half
-    turn = _quaternion_product(np.array([*half_binormal, 1.0]), np.array([0.0, 0.0, sin_half / cos_half, 1.0]))
+    turn = rotations.product(np.array([*half_binormal, 1.0]), np.array([0.0, 0.0, sin_half / cos_half, 1.0]))
     vector, scalar = turn[:3], turn[3]
     sine = float(np.linalg.norm(vector))
     angle = 2 * math.atan2(sine, scalar)
@@ -216,11 +217,6 @@ def _tripod(scene: Scene, k: int, spec: FlagellumSpec, e1: Array, edge: Array) -
         problem = f"points against the first segment of flagellum {k}: the hook joint is undefined there"
         raise SceneError(key, spec.motor_axis_angle, problem)
     return e1 - np.dot(e1, motor_axis) / (1 + cosine) * (tangent + motor_axis)
-
-
-def _quaternion_product(a: Array, b: Array) -> Array:
-    """Product of two quaternions (x, y, z, w): b first, then a."""
-    return np.array([*(a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])), a[3] * b[3] - a[:3] @ b[:3]])
 
 
 def rotation_matrix(axis: Array, angle: float | Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpflag.base import rotations
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.record import Frame, Record, RecordError
 from warpflag.scene import Scene, SceneError
@@ -69,9 +70,7 @@ def _check_outside(scene: Scene, start: InitialState) -> None:
 
 def _check_anchors(scene: Scene, start: InitialState) -> None:
     """A record of flagella anchored elsewhere would tear them off the body in the first step."""
-    x, y, z, w = start.body_orientation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    to_lab = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    to_lab = rotations.matrix(start.body_orientation)
     for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
         around, radius = np.radians(spec.azimuth), scene.body.width / 2
         anchor = np.array([radius * np.cos(around), radius * np.sin(around), spec.anchor_offset])

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from warpflag.observables.arrays import Array, flagella
 
-__all__ = ["BUNDLE_DISTANCE", "STRAY", "ZIPPED", "bundle_length", "bundled_fraction", "bundled_nodes", "zip_time"]
+__all__ = ["BUNDLE_DISTANCE", "STRAY", "ZIPPED", "bundle_length", "bundled_fraction", "bundled_nodes", "near_segments", "zip_time"]
 
 BUNDLE_DISTANCE = 0.44
 """Twice the radius of the normal flagellar helix, 2R [um]: a node this near to another flagellum is bundled."""
@@ -55,24 +55,31 @@ def bundled_nodes(
         rows = max(1, pairs_at_once // max(1, len(starts)))
         for row in range(first, end, rows):
             stop = min(row + rows, end)
-            bundled[row:stop] = _near_segments(nodes[row:stop], starts, vectors, distance)
+            bundled[row:stop] = near_segments(nodes[row:stop], starts, vectors, distance)
     return bundled
 
 
-def _near_segments(points: Array, starts: Array, vectors: Array, distance: float) -> NDArray[np.bool_]:
-    """Which points, shape [count, 3], lie within `distance` of any segment start + s vector, s in [0, 1]."""
-    squared_lengths = np.vecdot(vectors, vectors)
+def near_segments(points: Array, starts: Array, vectors: Array, distance: float) -> NDArray[np.bool_]:
+    """Which points lie within a distance of any segment start + s vector, s in [0, 1], shape [..., point_count].
+
+    Args:
+        points: [um], shape [..., point_count, 3].
+        starts: of the segments [um], shape [..., segment_count, 3].
+        vectors: from start to end of the segments [um], same shape.
+        distance: [um].
+    """
+    squared_lengths = np.vecdot(vectors, vectors)[..., None, :]
     inverse = 1.0 / np.maximum(squared_lengths, np.finfo(float).tiny)
     # With along = (p - start).vector, the squared distance is |p - start|^2 - s (2 along - s |vector|^2).
-    along = points @ vectors.T - np.vecdot(starts, vectors)
-    squared = (-2.0 * points) @ starts.T
-    squared += np.vecdot(points, points)[:, None]
-    squared += np.vecdot(starts, starts)
+    along = points @ np.swapaxes(vectors, -1, -2) - np.vecdot(starts, vectors)[..., None, :]
+    squared = (-2.0 * points) @ np.swapaxes(starts, -1, -2)
+    squared += np.vecdot(points, points)[..., None]
+    squared += np.vecdot(starts, starts)[..., None, :]
     s = np.clip(along * inverse, 0.0, 1.0)
     along *= 2.0
     along -= s * squared_lengths
     squared -= s * along
-    return (squared <= distance * distance).any(axis=1)
+    return (squared <= distance * distance).any(axis=-1)
 
 
 def bundled_fraction(

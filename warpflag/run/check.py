@@ -19,7 +19,14 @@ _SAMPLE_SECONDS = 0.3
 def report(scene: Scene, device: str | None = None) -> str:
     """The resolved scene as TOML, and below it as comments what it requires.
 
-    Raises SceneError, DeviceError, and NumericalError where the scene does not survive its first steps.
+    Args:
+        scene: to look at.
+        device: "cpu", "cuda:0", ...; None: the preferred one.
+
+    Raises:
+        DeviceError: there is no such device.
+        NumericalError: a guard is violated in the first steps.
+        SceneError: the scene can't be simulated.
     """
     simulation = Simulation(scene, device=device)
     flagella = scene.resolved_flagella()

@@ -1,4 +1,4 @@
-"""Checkpoints: the state a run continues from, in small files apart from the record.
+"""Checkpoints: the state that a run continues from, in small files apart from the record.
 
 A checkpoint appears under its name only when it is whole on the disk (temporary name, fsync, os.replace), and
 the one before it is kept: where the newest turns out damaged, the older one is loaded.
@@ -10,14 +10,14 @@ import json
 import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CheckpointError", "load", "save"]
+__all__ = ["CheckpointError", "exists", "load", "save"]
 
 _KEPT = 2
 _NAME = re.compile(r"checkpoint-(\d+)\.npz")
@@ -30,10 +30,16 @@ class CheckpointError(ValueError):
 def save(directory: str | Path, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> Path:
     """Writes a checkpoint into a run directory and removes all but the last two.
 
-    arrays: by name, any shape and dtype but objects. meta: what JSON can hold (time, step, ...).
+    Args:
+        directory: of the run.
+        arrays: by name, any shape and dtype but objects.
+        meta: what JSON can hold (time, step, ...).
 
-    Returns its path; from then on the checkpoint survives the end of the process and a power cut. Raises
-    ValueError for an array of objects.
+    Returns:
+        Its path; from then on the checkpoint survives the end of the process and a power cut.
+
+    Raises:
+        ValueError: an array holds objects.
     """
     objects = [name for name, array in arrays.items() if np.asarray(array).dtype.hasobject]
     if objects:
@@ -55,21 +61,41 @@ def save(directory: str | Path, arrays: Mapping[str, NDArray[Any]], meta: Mappin
     return path
 
 
-def load(directory: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The arrays and meta of the latest checkpoint in a run directory that can be read whole.
+def load(
+    directory: str | Path, fits: Callable[[dict[str, Any]], bool] = lambda meta: True
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    """The arrays and meta of the latest checkpoint in a run directory that can be read whole and fits.
 
-    Raises CheckpointError where there is none.
+    Args:
+        directory: of the run.
+        fits: whether a checkpoint of this meta may be taken; else the one before it is looked at.
+
+    Raises:
+        CheckpointError: there is none.
     """
-    numbered = _numbered(Path(directory))
+    numbered, readable = _numbered(Path(directory)), 0
     for _, path in reversed(numbered):
         try:
             with np.load(path, allow_pickle=False) as data:
                 meta = json.loads(str(data["meta"]))
-                return {name[len("array.") :]: data[name] for name in data.files if name != "meta"}, meta
+                arrays = {name[len("array.") :]: data[name] for name in data.files if name != "meta"}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
             continue
-    found = f"none of its {len(numbered)} can be read" if numbered else "it holds none"
+        readable += 1
+        if fits(meta):
+            return arrays, meta
+    if not numbered:
+        found = "it holds none"
+    elif not readable:
+        found = f"none of its {len(numbered)} can be read"
+    else:
+        found = "none belongs to a frame of its record"
     raise CheckpointError(f"{directory}: no checkpoint to continue from, {found}")
+
+
+def exists(directory: str | Path) -> bool:
+    """Whether a run directory holds any checkpoint, sound or not."""
+    return bool(_numbered(Path(directory)))
 
 
 def _numbered(directory: Path) -> list[tuple[int, Path]]:

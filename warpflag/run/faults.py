@@ -36,12 +36,14 @@ _ADVICE = {
 
 
 class NumericalError(RuntimeError):
-    """The run has lost its numerical footing: what, when, which flagellum, what to try, in one line.
+    """A step violated a guard: what, when, which flagellum, what to try, in one line.
 
     Attributes:
-        time: of the step that violated a guard [s].
-        cell, flagellum, segment: where; segment counts from the body, 0 is the motor joint.
         kind: which guard.
+        time: of the step [s].
+        cell: number in its batch.
+        flagellum: number in its cell.
+        segment: counted from the body; 0 is the motor joint.
     """
 
     def __init__(self, kind: Fault, time: float, cell: int, flagellum: int, segment: int) -> None:

@@ -1,4 +1,4 @@
-"""One run in its directory: run.h5, movie.usdc, scene.toml, summary.json, and checkpoints to continue from.
+"""Runs: one scene in its directory, or a batch of scenes that one simulation advances, a directory each.
 
 A run can be killed at any time: the record holds every frame committed by then, and `resume` goes on from the last
 checkpoint with the numbers of a run that was never stopped.
@@ -7,191 +7,208 @@ checkpoint with the numbers of a run that was never stopped.
 from __future__ import annotations
 
 import json
-import math
 import sys
-import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
-from warpflag.base.progress import Progress
+import numpy as np
+
+from warpflag import __version__
 from warpflag.model.start import shape_of_frame
 from warpflag.record import RECORD_NAME, Record
-from warpflag.record.recorder import Recorder
-from warpflag.record.reporters import start_reporter, versions
 from warpflag.run import checkpoint
-from warpflag.run.faults import NumericalError
-from warpflag.run.run_directory import MOVIE_NAME, SCENE_NAME, SUMMARY_NAME, RunError, claim_directory, write_whole
+from warpflag.run.execute import Run
+from warpflag.run.lock import Lock
+from warpflag.run.member import Member, Outcome
+from warpflag.run.run_directory import (
+    SCENE_NAME,
+    SUMMARY_NAME,
+    RunError,
+    claim_directory,
+    dynamics_sha256,
+    recorded_scene,
+    write_whole,
+)
 from warpflag.run.simulation import Simulation
-from warpflag.run.summary import digest, plain
-from warpflag.scene import Scene, SceneError, dumps, load, with_values
+from warpflag.scene import Scene, SceneError, dumps, with_values
 from warpflag.scene.scene_file import read_overrides
-from warpflag.view.usd import write_movie
 
-__all__ = ["Outcome", "Run", "resume", "start"]
-
-_SECONDS_PER_CHECKPOINT = 5.0
-_SECONDS_BEFORE_EXPLAINING = 2.0
+__all__ = ["Outcome", "Run", "begun_at_checkpoint", "resume", "resume_batch", "start", "start_batch"]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended.
-
-    status: done; stopped, by a guard; interrupted, by Ctrl-C. message: one line for the user.
-    """
-
-    status: str
-    message: str
-
-
-class Run:
-    """A simulation that writes its run directory; made by `start` or `resume`.
-
-    began: when, by the monotonic clock [s]; earlier by the time that the run took before it was resumed.
-    """
-
-    def __init__(self, directory: Path, simulation: Simulation, recorder: Recorder, began: float) -> None:
-        self.directory, self.simulation, self.recorder = directory, simulation, recorder
-        self.scene = simulation.scenes[0]
-        self._began = began
-
-    def execute(self, quiet: bool = False) -> Outcome:
-        """Runs to the end of the scene, or until a guard or Ctrl-C stops it; the directory is complete afterwards."""
-        progress = Progress(self.scene.duration, quiet=quiet)
-        fault: NumericalError | None = None
-        status = "done"
-        try:
-            start_reporter(self.recorder, self.scene, self.simulation.first_node)
-            self._prepare(quiet)
-            progress.update(float(self.simulation.times[0]))
-            self._record(progress)
-        except KeyboardInterrupt:
-            status = "interrupted"
-        except NumericalError as error:
-            status, fault = "stopped", error
-        finally:
-            progress.close()
-            self.recorder.close()
-        message = self._finish(status, fault)
-        return Outcome(status, f"{self.scene.name}: {message}")
-
-    def _prepare(self, quiet: bool) -> None:
-        said = "warpflag: compiling kernels, once on each machine\n"
-        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, sys.stderr.write, [said])
-        if not quiet:
-            timer.start()
-        try:
-            self.simulation.prepare()
-        finally:
-            timer.cancel()
-
-    def _record(self, progress: Progress) -> None:
-        saved = -math.inf
-        for frame in self.simulation.frames(self.scene.duration, progress.update):
-            self.recorder.write(frame)
-            if monotonic() - saved > _SECONDS_PER_CHECKPOINT:
-                self.recorder.flush()
-                self._save()
-                saved = monotonic()
-
-    def _save(self) -> None:
-        meta = {
-            "step": int(self.simulation.steps[0]),
-            "time": float(self.simulation.times[0]),
-            "wall_time": monotonic() - self._began,
-            "device": self.simulation.device.alias,
-            "versions": versions(),
-        }
-        checkpoint.save(self.directory, self.simulation.checkpoint(), meta)
-
-    def _finish(self, status: str, fault: NumericalError | None) -> str:
-        """Last checkpoint, summary and movie; returns what the user is told."""
-        if self.recorder.frame_count == 0:
-            return f"interrupted before the first frame; start again with --resume {self.directory}"
-        if status == "done":  # else the state is one between two frames
-            self._save()
-        with Record(self.directory) as record:
-            found = digest(record, self.scene)
-            wall_time = monotonic() - self._began
-            ending = {"status": status, "message": str(fault) if fault else "", "wall_time": wall_time}
-            summary = {**ending, **self._facts(fault), **found}
-            write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
-            write_movie(record, self.directory / MOVIE_NAME)
-        count = found["frames"]
-        reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
-        return {
-            "done": f"{reached} in {wall_time:.1f} s: {self.directory}",
-            "interrupted": f"interrupted, {reached} kept; resumable with --resume {self.directory}",
-            "stopped": f"{fault}; {reached} kept in {self.directory}",
-        }[status]
-
-    def _facts(self, fault: NumericalError | None) -> dict[str, Any]:
-        simulation = self.simulation
-        memory, system = simulation.stepper.memory(), simulation.system
-        violated = None
-        if fault:
-            place = {"flagellum": fault.flagellum, "segment": fault.segment}
-            violated = {"kind": fault.kind.name.lower(), "time": fault.time, **place}
-        return {
-            "scene": self.scene.name,
-            "duration": self.scene.duration,
-            "steps": simulation.steps[0],
-            "rejected_steps": memory["rejected"][0] if "rejected" in memory else 0,
-            "evaluations": memory["evaluations"][0],
-            "guards": {"steps_between_checks": system.guard.interval.numpy()[0], "violated": violated},
-            "precision": self.scene.numerics.precision,
-            "stepper": self.scene.numerics.stepper,
-            "device": simulation.device.alias,
-            "device_name": simulation.device.name,
-            "kernel_flags": system.model.precision.cpu_flags if simulation.device.is_cpu else "",
-            "versions": versions(),
-        }
-
-
-def start(scene: Scene, output: str | None = None, device: str | None = None) -> Run:
+def start(scene: Scene, output: str | None = None, device: str | None = None, **options: Any) -> Run:
     """A new run. The directory is made once the scene is known to be sound.
 
-    output: its directory; None: runs/NAME, or runs/NAME-2, -3, ... when taken.
+    Args:
+        scene: to run.
+        output: its directory; None: runs/NAME, or runs/NAME-2, -3, ... when taken.
+        device: "cpu", "cuda:0", ...; None: the preferred one.
+        options: `movies` and `checkpoint_seconds` of `Run`.
 
-    Raises SceneError, DeviceError, and RunError where `output` holds a run or can't be made.
+    Raises:
+        DeviceError: there is no such device.
+        LockedError: another process has just taken the directory.
+        RunError: `output` holds a run or can't be made.
+        SceneError: the scene can't be simulated.
     """
-    began = monotonic()
     simulation = Simulation(scene, device=device)
-    directory = claim_directory(scene.name, output)
+    directory, lock = claim_directory(scene.name, output)
     write_whole(directory / SCENE_NAME, dumps(scene))
-    return Run(directory, simulation, Recorder(directory / RECORD_NAME), began)
+    return Run(simulation, [Member(directory, scene, lock)], **options)
 
 
-def resume(directory: str, overrides: Sequence[str] = (), device: str | None = None) -> Run:
+def start_batch(
+    scenes: Sequence[Scene],
+    directories: Sequence[Path],
+    device: str | None = None,
+    strict: bool = False,
+    **options: Any,
+) -> Run:
+    """New runs of scenes that one simulation advances together.
+
+    Args:
+        scenes: all with the same precision, stepper and switches.
+        directories: of the runs; they hold none yet.
+        device: "cpu", "cuda:0", ...; None: the preferred one.
+        strict: kernels built without reassociation, for comparisons to the last bit.
+        options: `movies` and `checkpoint_seconds` of `Run`.
+
+    Raises:
+        As `start`.
+    """
+    simulation = Simulation(scenes, device=device, strict=strict)
+    locks: list[Lock] = []
+    members = []
+    try:
+        for scene, path in zip(scenes, directories, strict=True):
+            directory, lock = claim_directory(scene.name, str(path))
+            locks.append(lock)
+            write_whole(directory / SCENE_NAME, dumps(scene))
+            members.append(Member(directory, scene, lock, alone=len(scenes) == 1))
+    except BaseException:
+        for lock in locks:
+            lock.release()
+        raise
+    return Run(simulation, members, **options)
+
+
+def resume(directory: str, overrides: Sequence[str] = (), device: str | None = None, **options: Any) -> Run:
     """The run of a directory from its last checkpoint on, or from its start where it came to none.
 
-    overrides: "duration=..." and nothing else; frames keep their interval. device: None is the one it ran on.
+    Args:
+        directory: of the run.
+        overrides: "duration=..." and nothing else; frames keep their interval.
+        device: None: the one it ran on.
+        options: `movies` and `checkpoint_seconds` of `Run`.
 
-    Raises SceneError, DeviceError, RecordError, CheckpointError, and RunError where there is no run.
+    Raises:
+        CheckpointError: no checkpoint can be read.
+        DeviceError: there is no such device.
+        LockedError: another process writes the run.
+        RecordError: the record can't be read.
+        RunError: there is no run, or its files are not of one run.
+        SceneError: the scene or the duration is not allowed.
     """
-    began, path = monotonic(), Path(directory)
-    if not (path / SCENE_NAME).is_file():
-        raise RunError(f"--resume {directory}: holds no run, there is no {SCENE_NAME}")
-    scene = _prolonged(load(path / SCENE_NAME), overrides)
-    if not (path / RECORD_NAME).exists():
-        return Run(path, Simulation(scene, device=device), Recorder(path / RECORD_NAME), began)
-    arrays, meta = checkpoint.load(path)
+    return resume_batch([directory], overrides, device, **options)
+
+
+def resume_batch(
+    directories: Sequence[str | Path],
+    overrides: Sequence[str] = (),
+    device: str | None = None,
+    strict: bool = False,
+    **options: Any,
+) -> Run:
+    """Runs that one simulation advances together, each from its own last checkpoint on; see `resume`.
+
+    All are taken up at a checkpoint, or all start again: where some have none, those have to be resumed by themselves.
+    """
+    locks: list[Lock] = []
+    try:
+        return _resumed([Path(directory) for directory in directories], overrides, device, strict, options, locks)
+    except BaseException:
+        for lock in locks:
+            lock.release()
+        raise
+
+
+def _resumed(
+    paths: list[Path],
+    overrides: Sequence[str],
+    device: str | None,
+    strict: bool,
+    options: dict[str, Any],
+    locks: list[Lock],
+) -> Run:
+    scenes, metas, parts, origins = [], [], [], []
+    for path in paths:
+        if not (path / SCENE_NAME).is_file():
+            raise RunError(f"--resume {path}: holds no run, there is no {SCENE_NAME}")
+        locks.append(Lock(path))
+        scenes.append(_prolonged(recorded_scene(path, bool(overrides)), overrides))
+    if len(paths) == 1 and _is_done(paths[0], scenes[0]):
+        return Run(None, [_done_already(paths[0], scenes[0], locks[0])])
+    begun = [begun_at_checkpoint(path) for path in paths]
+    if not any(begun):
+        for path in paths:
+            (path / RECORD_NAME).unlink(missing_ok=True)  # frames without a checkpoint: they are computed again
+        simulation = Simulation(scenes, device=device, strict=strict)
+    elif all(begun):
+        for path, scene in zip(paths, scenes, strict=True):
+            arrays, meta = _checkpoint(path, scene)
+            parts.append(arrays)
+            metas.append(meta)
+            with Record(path) as record:
+                origins.append(shape_of_frame(record.frame(0), record.first_node))
+        simulation = Simulation(scenes, starts=origins, device=device or metas[0]["device"], strict=strict)
+        try:
+            names = parts[0].keys()
+            simulation.restore({name: np.concatenate([part[name] for part in parts]) for name in names})
+        except (KeyError, ValueError) as error:
+            raise RunError(f"--resume {paths[0]}: {error}") from None
+    else:
+        raise RunError(f"--resume {paths[0]}: some runs of the batch have a checkpoint and some have none")
+    members = []
+    for k, (path, scene, lock) in enumerate(zip(paths, scenes, locks, strict=True)):
+        write_whole(path / SCENE_NAME, dumps(scene))
+        members.append(Member(path, scene, lock, metas[k] if metas else None, alone=len(paths) == 1))
+    return Run(simulation, members, **options)
+
+
+def begun_at_checkpoint(directory: Path) -> bool:
+    """Whether a run goes on from a checkpoint, and not from its start."""
+    return (directory / RECORD_NAME).exists() and checkpoint.exists(directory)
+
+
+def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The latest checkpoint whose frame the record holds."""
+    with Record(path) as record:
+        times = record.times
+    arrays, meta = checkpoint.load(path, lambda meta: bool((np.abs(times - meta["time"]) <= 1e-12 * times[-1]).any()))
+    if meta.get("dynamics_sha256") != dynamics_sha256(scene):
+        raise RunError(f"--resume {path}: its checkpoint is of another scene than {SCENE_NAME}")
     if scene.duration < meta["time"] * (1 - 1e-9):
         problem = f"must not be below {meta['time']:g} s, where the run stands"
-        raise SceneError("duration", scene.duration, problem, source=f"--resume {directory}")
-    with Record(path) as record:
-        origin = shape_of_frame(record.frame(0), record.first_node)
-    simulation = Simulation(scene, starts=origin, device=device or meta["device"])
+        raise SceneError("duration", scene.duration, problem, source=f"--resume {path}")
+    if (written := meta["versions"]["warpflag"]) != __version__:
+        print(f"warpflag: {path} was written by version {written}, this is {__version__}", file=sys.stderr)
+    return arrays, meta
+
+
+def _is_done(path: Path, scene: Scene) -> bool:
     try:
-        simulation.restore(arrays)
-    except ValueError as error:
-        raise RunError(f"--resume {directory}: {error}") from None
-    write_whole(path / SCENE_NAME, dumps(scene))
-    recorder = Recorder(path / RECORD_NAME, resume_step=meta["step"])
-    return Run(path, simulation, recorder, began - meta["wall_time"])
+        summary = json.loads((path / SUMMARY_NAME).read_text(encoding="utf-8"))
+        return summary["status"] == "done" and summary["duration"] == scene.duration
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _done_already(path: Path, scene: Scene, lock: Lock) -> Member:
+    member = Member(path, scene, lock)
+    lock.release()
+    member.outcome = Outcome("done", f"{scene.name}: is done already, {scene.duration * 1e3:.6g} ms: {path}")
+    return member
 
 
 def _prolonged(scene: Scene, overrides: Sequence[str]) -> Scene:

@@ -1,15 +1,32 @@
-"""The directory of a run: what lies in it, and how a new one is found."""
+"""The directory of a run: what lies in it, how a new one is found, and whether its parts belong together."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import itertools
+import os
+import re
 from pathlib import Path
 
 from warpflag.base.output import whole
-from warpflag.record import RECORD_NAME
+from warpflag.record import RECORD_NAME, Record
+from warpflag.run.lock import SWEEP_NAME, Lock
+from warpflag.scene import Scene, SceneError, dumps, load, loads
 
-__all__ = ["MOVIE_NAME", "SCENE_NAME", "SUMMARY_NAME", "RunError", "claim_directory", "write_whole"]
+__all__ = [
+    "MOVIE_NAME",
+    "SCENE_NAME",
+    "SUMMARY_NAME",
+    "RunError",
+    "check_same_scene",
+    "claim_directory",
+    "dynamics_sha256",
+    "recorded_scene",
+    "sync",
+    "write_whole",
+]
 
 MOVIE_NAME, SCENE_NAME, SUMMARY_NAME = "movie.usdc", "scene.toml", "summary.json"
 
@@ -18,28 +35,36 @@ class RunError(ValueError):
     """A run directory that can't be written or continued; one line."""
 
 
-def claim_directory(name: str, output: str | None) -> Path:
-    """Makes the directory of a new run.
+def claim_directory(name: str, output: str | None) -> tuple[Path, Lock]:
+    """Makes the directory of a new run and locks it.
 
-    name: of the scene. output: the directory; None: runs/NAME, or runs/NAME-2, -3, ... when taken.
+    Args:
+        name: of the scene.
+        output: the directory; None: runs/NAME, or runs/NAME-2, -3, ... when taken.
 
-    Raises RunError where `output` holds a run, or where the directory can't be made.
+    Raises:
+        LockedError: another process has just taken the directory.
+        RunError: the directory holds a run, or there can be no directory of that name.
+        OSError: the machine refuses it.
     """
     try:
-        return _free_directory(name) if output is None else _named_directory(output)
+        if output is None:
+            directory = _free_directory(name)
+            return directory, Lock(directory)
+        directory = Path(output)
+        directory.mkdir(parents=True, exist_ok=True)
+        lock = Lock(directory)
     except OSError as error:
-        raise RunError(f"-o {output or 'runs'}: can't be made: {error.strerror}") from None
-
-
-def _named_directory(output: str) -> Path:
-    """Makes the directory unless it holds a run."""
-    directory = Path(output)
-    directory.mkdir(parents=True, exist_ok=True)
-    for name in (RECORD_NAME, SCENE_NAME, SUMMARY_NAME):
-        if (directory / name).exists():
-            problem = f"holds a {name}; continue that run with --resume {output}, or name another -o"
+        if error.errno not in (errno.EEXIST, errno.ENOTDIR, errno.ENAMETOOLONG):
+            raise
+        named = f"-o {output}" if output else f"runs/{name}"
+        raise RunError(f"{named}: can't be made: {error.strerror}") from None
+    for taken in (RECORD_NAME, SCENE_NAME, SUMMARY_NAME, SWEEP_NAME):
+        if (directory / taken).exists():
+            lock.release()
+            problem = f"holds a {taken}; continue that run with --resume {output}, or name another -o"
             raise RunError(f"-o {output}: {problem}")
-    return directory
+    return directory, lock
 
 
 def _free_directory(name: str) -> Path:
@@ -58,3 +83,88 @@ def write_whole(path: Path, text: str) -> None:
     """Writes a text file that is whole or absent."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def sync(path: Path) -> None:
+    """Brings what was written of a file to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def dynamics_sha256(scene: Scene) -> str:
+    """Hash of everything in a scene but duration and frames: equal hashes mean the same motion."""
+    return hashlib.sha256(_dynamics(scene).encode()).hexdigest()
+
+
+def _dynamics(scene: Scene) -> str:
+    return re.sub(r"^(duration|frames) = .*\n", "", dumps(scene), flags=re.MULTILINE)
+
+
+def recorded_scene(directory: Path, prolonged: bool) -> Scene:
+    """The scene of a run directory, as its scene.toml and its record agree on it.
+
+    Args:
+        directory: of a run.
+        prolonged: whether a new duration is given, so that theirs may differ.
+
+    Raises:
+        RecordError: the record can't be read.
+        RunError: there is no scene, it is empty, or the record is of another one.
+        SceneError: the scene file is not valid.
+    """
+    path, record_path = directory / SCENE_NAME, directory / RECORD_NAME
+    if not path.is_file():
+        raise RunError(f"--resume {directory}: holds no run, there is no {SCENE_NAME}")
+    if not path.read_text(encoding="utf-8", errors="replace").strip():
+        raise RunError(f"--resume {directory}: {SCENE_NAME} is empty; the record's /parameters/scene has its text")
+    scene = load(path)
+    if not record_path.exists():
+        return scene
+    with Record(record_path) as record:
+        text, written_hash = record.scene_text, record.scene_sha256
+    if hashlib.sha256(text.encode()).hexdigest() != written_hash:
+        raise RunError(f"--resume {directory}: {RECORD_NAME}: /parameters/scene does not have the SHA-256 beside it")
+    try:
+        recorded = loads(text)
+    except SceneError as error:
+        raise RunError(f"--resume {directory}: {RECORD_NAME}: its scene can't be read: {error}") from None
+    different = _dynamics(recorded) != _dynamics(scene) if prolonged else dumps(recorded) != dumps(scene)
+    if different:
+        difference = _difference(recorded, scene)
+        problem = f"{SCENE_NAME} is not the scene of {RECORD_NAME}: {difference}; only --set duration=... may change"
+        raise RunError(f"--resume {directory}: {problem}")
+    return scene
+
+
+def check_same_scene(directory: Path, scene: Scene) -> None:
+    """That a scene is the one of a run directory.
+
+    Raises:
+        RunError: it is another one, and in which setting.
+    """
+    there = load(directory / SCENE_NAME)
+    if dumps(there) != dumps(scene):
+        raise RunError(f"{directory}: holds the run of another scene: {_difference(there, scene)}")
+
+
+def _difference(recorded: Scene, scene: Scene) -> str:
+    """The first setting in which two scenes differ, in words."""
+    section, sections = "", []
+    for text in (dumps(recorded), dumps(scene)):
+        settings: dict[str, str] = {}
+        tables = 0
+        for line in text.splitlines():
+            if header := re.match(r"\[+([\w.]+)\]+", line):
+                section = header[1]
+                if line.startswith("[["):
+                    section, tables = f"{section}.{tables}", tables + 1
+            elif value := re.match(r"(?:# )?(\w+) =\s*(.*?)\s*(?:#.*)?$", line):
+                settings[f"{section}.{value[1]}".lstrip(".")] = value[2] or "none"
+        sections.append(settings)
+        section = ""
+    old, new = sections
+    key = next(key for key in [*old, *new] if old.get(key) != new.get(key))
+    return f"{key} = {new.get(key, 'none')}, recorded with {old.get(key, 'none')}"

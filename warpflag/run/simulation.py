@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -12,21 +11,21 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock as control_stage
 from warpflag_kernels.base.plan import Plan
-from warpflag_kernels.contact import pair_forces
-from warpflag_kernels.rod import elastic, reconstruction
+from warpflag_kernels.rod import reconstruction
 from warpflag_kernels.stepping import health
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.base.device import find_device
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
-from warpflag.model.start import starting_state
 from warpflag.model.terms import supplied_power
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, start_reporter
+from warpflag.run.cells import Cells, CellsReader
 from warpflag.run.faults import NumericalError
-from warpflag.run.frames import frame_of
+from warpflag.run.frames import frames_of
+from warpflag.run.starts import starting_states
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 
@@ -51,7 +50,7 @@ class Simulation:
         strict: kernels built without reassociation, for comparisons to the last bit.
         plan: how kernels are executed, in place of what is chosen for the device; then neither `device` nor `strict`.
 
-    Errors:
+    Raises:
         SceneError: a scene can't be simulated.
         DeviceError: there is no such device.
         NumericalError: from `advance`, `frames` and `run`, when a guard is violated.
@@ -70,7 +69,7 @@ class Simulation:
     ) -> None:
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         if starts is None:
-            starts = [starting_state(scene) for scene in self.scenes]
+            starts = starting_states(self.scenes)
         elif isinstance(starts, InitialState):
             starts = [starts]
         model = build_model(self.scenes, plan or plan_of(self.scenes, find_device(device), strict))
@@ -82,12 +81,14 @@ class Simulation:
         self.first_node = model.data.first_node.numpy()
         self._first_flagellum = model.data.first_flagellum.numpy()
         self.reporters = list(reporters)
-        self._framed: CellState | None = None
+        self._framed: Cells | None = None
         self._capture, self._graph = capture, None
         self._checked = False
         self._passes_per_replay = 200
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
         self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
+        self._reader = CellsReader(self.system, self._energy, self._steric)
+        self._excluded = np.zeros(len(self.scenes), dtype=bool)
 
     def __repr__(self) -> str:
         scene, count = self.scenes[0], len(self.scenes)
@@ -114,7 +115,13 @@ class Simulation:
         """Advances by a simulated time [s], by default to the end of the scene, and hands frames to the reporters.
 
         Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state.
+
+        Raises:
+            NumericalError: a guard was violated.
+            ValueError: the duration is negative or not finite.
         """
+        if duration is not None and not 0.0 <= duration < float("inf"):
+            raise ValueError(f"a run takes a time from 0 on, not {duration}")
         until = self.scenes[0].duration if duration is None else float(self.times[0]) + duration
         reporters, self.reporters = self.reporters, []
         try:
@@ -128,30 +135,58 @@ class Simulation:
                 reporter.close()
         self.advance(until)
 
-    def frames(self, until: float, watch: Callable[[float], None] | None = None) -> Iterator[Frame]:
+    def frames(self, until: float, watch: Callable[[], None] | None = None) -> Iterator[Frame]:
         """Advances one scene to a time and yields a frame at each multiple of its duration / frames on the way.
 
         Args:
             until: simulated time to reach [s].
             watch: as in `advance`.
 
-        Errors:
-            ValueError: several scenes; their cells are advanced together and read with `cell_state`.
+        Raises:
+            NumericalError: a guard was violated.
+            ValueError: several scenes; `cell_frames` yields theirs.
         """
         if len(self.scenes) > 1:
-            raise ValueError("frames and reporters are of a single scene; advance a batch and read cell_state(cell)")
-        scene, first_node = self.scenes[0], self.first_node
-        length = float(np.mean([spec.length for spec in scene.resolved_flagella()]))
+            raise ValueError("frames and reporters are of a single scene; a batch has cell_frames")
+        for frames in self.cell_frames(until, watch):
+            yield from frames.values()
+        self._raise_fault()
+
+    def cell_frames(
+        self, until: float | None = None, watch: Callable[[], None] | None = None
+    ) -> Iterator[dict[int, Frame]]:
+        """Advances every cell from frame to frame, each at multiples of its own scene's duration / frames.
+
+        A cell that violates a guard, and one that was excluded, has no further frames; the others go on.
+
+        Args:
+            until: simulated time that no frame is beyond [s]; default: the end of each scene.
+            watch: as in `advance`.
+
+        Returns:
+            An iterator over the next frame of each cell that has one, by cell.
+        """
+        durations, counts = (
+            np.array([getattr(scene, name) for scene in self.scenes]) for name in ("duration", "frames")
+        )
+        lengths = [float(np.mean([spec.length for spec in scene.resolved_flagella()])) for scene in self.scenes]
         if self._framed is None:
             self._framed = self._present_state()
-            yield frame_of(self._framed, None, first_node, length)
-        k = math.floor(float(self.times[0]) / scene.duration * scene.frames + _ROUNDING)
-        last = math.floor(until / scene.duration * scene.frames + _ROUNDING)
-        while k < last:
-            k += 1
-            self.advance(scene.duration * k / scene.frames, watch)
-            before, self._framed = self._framed, self.cell_state()
-            yield frame_of(self._framed, before, first_node, length)
+            yield frames_of(self._framed, None, lengths, range(len(self.scenes)))
+        last = np.floor((durations if until is None else until) / durations * counts + _ROUNDING)
+        while True:
+            k = np.floor(self.times / durations * counts + _ROUNDING)
+            waiting = (k < last) & ~self._excluded & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
+            if not waiting.any():
+                return
+            self._advance(np.where(waiting, durations * (k + 1) / counts, 0.0), watch)
+            before, self._framed = self._framed, self._reader.read()
+            reached = waiting & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
+            yield frames_of(self._framed, before, lengths, np.flatnonzero(reached))
+
+    def exclude(self, cell: int) -> None:
+        """Advances a cell no further: `cell_frames` goes on with the others."""
+        self._excluded[cell] = True
 
     def prepare(self) -> None:
         """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
@@ -167,23 +202,25 @@ class Simulation:
             wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
         self._graph = captured.graph
 
-    def advance(self, until: float, watch: Callable[[float], None] | None = None) -> None:
+    def advance(self, until: float, watch: Callable[[], None] | None = None) -> None:
         """Advances every cell to one time.
 
         Args:
             until: simulated time to reach [s].
-            watch: called a few times a second with the time reached by the slowest cell [s].
+            watch: called a few times a second; what it raises ends the advance.
 
-        Errors:
+        Raises:
             NumericalError: a guard was violated; the device holds the offending state, frames taken before are sound.
         """
+        self._advance(np.full(len(self.scenes), float(until)), watch)
+        self._raise_fault()
+
+    def _advance(self, until: np.ndarray, watch: Callable[[], None] | None = None) -> None:
+        """Advances every sound cell to its own time [s], shape [cell_count]; past times leave a cell where it is."""
         control, state = self.system.control, self.system.state.data
         self.prepare()
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
-        if not waiting.any():
-            self._raise_fault()
-            return
-        control.target.fill_(until)
+        control.target.assign(until)
         state.active.assign(waiting.astype(np.int32))
         control.unfinished.fill_(int(waiting.sum()))
         while control.unfinished.numpy()[0] > 0:
@@ -196,32 +233,32 @@ class Simulation:
                 per_pass = (clock.perf_counter() - started) / self._passes_per_replay
                 self._passes_per_replay = int(np.clip(_SECONDS_PER_REPLAY / per_pass, 20, 1_000_000))
             if watch is not None:
-                watch(float(self.times.min()))
-        self._raise_fault()
+                watch()
+
+    @property
+    def faults(self) -> dict[int, NumericalError]:
+        """The violated guard of each cell that was stopped by one, by cell."""
+        found = {}
+        for cell, code in enumerate(self.system.control.fault.numpy()):
+            if code != control_stage.NO_FAULT:
+                kind, element = health.decode(int(code))
+                flagellum = int(np.searchsorted(self.first_node, element, side="right")) - 1
+                segment = element - int(self.first_node[flagellum])
+                own = flagellum - int(self._first_flagellum[cell])
+                found[cell] = NumericalError(kind, float(self.times[cell]), cell, own, segment)
+        return found
+
+    def _raise_fault(self) -> None:
+        for error in self.faults.values():
+            raise error
+
+    def cells(self) -> Cells:
+        """All cells on the host, each at the time it has reached; valid after `advance`."""
+        return self._reader.read()
 
     def cell_state(self, cell: int = 0) -> CellState:
         """One cell on the host, at the time it has reached; valid after `advance`."""
-        s, chart, model = self.system.state, self.system.chart, self.system.model
-        flagella, nodes = self._own(cell)
-        centre = chart.base.body_position.numpy()[cell]
-        elastic.elastic_energy(model, s, self._energy)
-        steric_force = 0.0
-        if model.switches.has("steric"):
-            pair_forces.steric_magnitudes(model, s, self._steric)
-            steric_force = 0.5 * float(self._steric.numpy()[nodes].sum(dtype=np.float64))
-        return CellState(
-            time=float(self.times[cell]),
-            step=int(self.steps[cell]),
-            positions=chart.base.position.numpy()[nodes].astype(np.float64) + centre,
-            directors=chart.base.director.numpy()[nodes].astype(np.float64),
-            tangents=chart.base.tangent.numpy()[nodes].astype(np.float64),
-            motor_angle=chart.motor_angle.numpy()[flagella].copy(),
-            body_angle=float(chart.body_angle.numpy()[cell]),
-            body_position=centre.copy(),
-            body_orientation=chart.base.body_orientation.numpy()[cell].copy(),
-            elastic_energy=self._energy.numpy()[nodes].sum(axis=0, dtype=np.float64),
-            steric_force=steric_force,
-        )
+        return self.cells().cell(cell)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
@@ -231,7 +268,7 @@ class Simulation:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes back what `checkpoint` gave, in a simulation of the same scenes.
 
-        Errors:
+        Raises:
             ValueError: the arrays are of another simulation.
         """
         carried = self._carried()
@@ -247,6 +284,14 @@ class Simulation:
         self.stepper.restart()
         self.stepper.recall(memory)
         self._framed = self._present_state()
+
+    def part(self, arrays: Mapping[str, np.ndarray], cell: int) -> dict[str, np.ndarray]:
+        """The part of a checkpoint that belongs to one cell: the checkpoint of that cell alone."""
+        flagella, nodes = self._own(cell)
+        sizes = (len(self.scenes), self._first_flagellum[-1], self.first_node[-1])
+        # Where two of the sizes are equal, each cell has one flagellum, and the parts are equal too.
+        rows = dict(zip(sizes, (slice(cell, cell + 1), flagella, nodes), strict=True))
+        return {name: values[rows[len(values)]] for name, values in arrays.items()}
 
     def _carried(self) -> dict[str, Any]:
         control, chart = self.system.control, self.system.chart
@@ -305,11 +350,11 @@ class Simulation:
             array.zero_()
         reconstruction.reconstruct(self.system.model, s, chart)
 
-    def _present_state(self) -> CellState:
-        """The first cell before any step, or after a state was set from outside."""
+    def _present_state(self) -> Cells:
+        """The cells before any step, or after a state was set from outside."""
         self._reconstruct()
         self.system.state.data.active.zero_()
-        return self.cell_state()
+        return self.cells()
 
     def _check_start(self) -> None:
         """The guards look at the state that the first step starts from."""
@@ -321,12 +366,3 @@ class Simulation:
         chart.rest.zero_()
         s.data.active.zero_()
         self._checked = True
-
-    def _raise_fault(self) -> None:
-        faults = self.system.control.fault.numpy()
-        for cell in np.flatnonzero(faults != control_stage.NO_FAULT):
-            kind, element = health.decode(int(faults[cell]))
-            flagellum = int(np.searchsorted(self.first_node, element, side="right")) - 1
-            segment = element - int(self.first_node[flagellum])
-            own = flagellum - int(self._first_flagellum[cell])
-            raise NumericalError(kind, float(self.times[cell]), int(cell), own, segment)

@@ -21,9 +21,15 @@ SYNCHRONISED = 0.15
 def digest(record: Record, scene: Scene) -> dict[str, Any]:
     """Observables of the last frame, rates over the last third of the recorded time, and first times of two events.
 
-    record: with at least one frame. Rates: `motor_rate` relative to the body and `motor_rate_lab` [Hz, per
-    flagellum], `body_rate` about the rearward axis [Hz], `net_speed`, displacement over time [um/s]; None where the
-    window is a single frame. Events: time [s] of the first frame, None where there is none.
+    Args:
+        record: with at least one frame.
+        scene: of the record.
+
+    Returns:
+        `time` [s] and number of `frames`; `observables` by name; `rates`: `motor_rate` relative to the body and
+        `motor_rate_lab` [Hz], shape [flagellum_count], `body_rate` about the rearward axis [Hz] and `net_speed`,
+        displacement over time [um/s], None where the window is a single frame; `events`: time of the first frame that
+        is `synchronised` and that is `zipped` [s], None where there is none.
     """
     times, measured = record.times, record.observables
     return {

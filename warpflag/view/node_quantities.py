@@ -10,15 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from warpflag_kernels.contact.constants import CUTOFF
 
-from warpflag.observables import local_phase_difference, segment_tangents
+from warpflag.observables import closest_parameters, local_phase_difference, segment_tangents, steric_force
 
 __all__ = ["contact_load", "curvature", "nearest_phase_difference"]
 
 Array = NDArray[np.floating]
-
-_CUTOFF = 2.0 ** (1.0 / 6.0)  # of the steric force, in units of sigma
-_LINEAR_BELOW = 0.7
 
 
 def curvature(positions: Array, first_node: NDArray[np.integer]) -> Array:
@@ -92,10 +90,9 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
 
     It is the node's shares of |F| from every contact between segments of different flagella.
 
-    The force of the simulation (kernels: steric): F_0 [2 (sigma/r)^13 - (sigma/r)^7] below 2^(1/6) sigma, along its
-    tangent below 0.7 sigma, r the least distance of two segments; at parameter t of a segment it acts by 1 - t on
-    the first and t on the second node. Every contact counts on both sides, so a frame's sum is twice the recorded
-    steric force.
+    The force between two segments is `steric_force` of their least distance; at parameter t of a segment it acts by
+    1 - t on the first and t on the second node. Every contact counts on both sides, so a frame's sum is twice the
+    recorded steric force.
 
     Args:
         positions: nodes [um], shape [frame, node, 3].
@@ -110,21 +107,15 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
     flagellum = np.repeat(np.arange(len(first_node) - 1), np.diff(first_node))[last]
     starts, vectors = positions[:, last - 1], positions[:, last] - positions[:, last - 1]
     longest = float(np.sqrt(np.vecdot(vectors, vectors).max()))
-    i, j = _near_pairs(starts + 0.5 * vectors, longest + _CUTOFF * diameter, flagellum)
+    i, j = _near_pairs(starts + 0.5 * vectors, longest + CUTOFF * diameter, flagellum)
     starts, vectors = starts.reshape(-1, 3), vectors.reshape(-1, 3)
-    distance, s, t = _closest(starts[i], vectors[i], starts[j], vectors[j])
-    force = _steric_force(distance / diameter, strength)
+    s, t = closest_parameters(starts[i], vectors[i], starts[j], vectors[j])
+    gap = starts[i] + s[:, None] * vectors[i] - starts[j] - t[:, None] * vectors[j]
+    force = steric_force(np.sqrt(np.vecdot(gap, gap)), strength, diameter)
     node = (np.arange(frames)[:, None] * nodes + last).ravel()
     shares = ((node[i] - 1, 1.0 - s), (node[i], s), (node[j] - 1, 1.0 - t), (node[j], t))
     load = sum(np.bincount(where, share * force, frames * nodes) for where, share in shares)
     return np.reshape(load, (frames, nodes))
-
-
-def _steric_force(x: Array, strength: float) -> Array:
-    """The steric force at distances x in units of sigma [pN]."""
-    y = 1.0 / np.maximum(x, _LINEAR_BELOW)
-    force = 2.0 * y**13 - y**7 + (26.0 * y**14 - 7.0 * y**8) * np.maximum(_LINEAR_BELOW - x, 0.0)
-    return np.where(x < _CUTOFF, strength * force, 0.0)
 
 
 def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tuple[NDArray, NDArray]:
@@ -162,18 +153,3 @@ def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tupl
         near = np.vecdot(away, away) < reach * reach
         pairs.append((order[i[near]], order[j[near]]))
     return np.concatenate([i for i, _ in pairs]), np.concatenate([j for _, j in pairs])
-
-
-def _closest(p1: Array, d1: Array, p2: Array, d2: Array) -> tuple[Array, Array, Array]:
-    """Least distance of segments p1 + s d1 and p2 + t d2, and its s and t in [0, 1]; shapes [pair]."""
-    r = p1 - p2
-    a, e, b = np.vecdot(d1, d1), np.vecdot(d2, d2), np.vecdot(d1, d2)
-    c, f = np.vecdot(d1, r), np.vecdot(d2, r)
-    denominator = a * e - b * b
-    parallel = denominator <= 1e-7 * a * e
-    s = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, denominator), 0.0, 1.0))
-    t = (b * s + f) / e
-    s = np.where(t < 0.0, np.clip(-c / a, 0.0, 1.0), np.where(t > 1.0, np.clip((b - c) / a, 0.0, 1.0), s))
-    t = np.clip(t, 0.0, 1.0)
-    gap = r + s[:, None] * d1 - t[:, None] * d2
-    return np.sqrt(np.vecdot(gap, gap)), s, t

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from warpflag.base import rotations
 from warpflag.observables import motor_axes
 from warpflag.record import Record
 from warpflag.scene import Scene
@@ -34,9 +35,7 @@ def body_axes(orientation: ArrayLike) -> Array:
     Args:
         orientation: quaternion (x, y, z, w) from body to lab axes, shape [4]; its norm is divided out.
     """
-    x, y, z, w = np.asarray(orientation, float) / np.linalg.norm(orientation)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return (np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross).T
+    return rotations.matrix(orientation).T
 
 
 def motors(record: Record, scene: Scene) -> Motors:

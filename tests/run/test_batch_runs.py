@@ -1,0 +1,215 @@
+"""Batches that write: each member's directory is that of its own single run, whatever happens to the others."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.runs import arrays, assert_same_frames, small, summary
+from warpflag import observables
+from warpflag.observables import cells
+from warpflag.record import Record
+from warpflag.run import run
+from warpflag.run.simulation import Simulation
+from warpflag.scene import Scene, dumps, load
+
+
+def members() -> list[Scene]:
+    """Cells that share nothing but their terms: torques, lengths, numbers of flagella, ends and frames."""
+    return [
+        small({"name": "a"}),
+        small({"name": "b", "motor.torque": 1.0, "duration": 6e-5, "frames": 3}),
+        small({"name": "c", "flagella.count": 3, "flagella.length": 1.6}),
+        small({"name": "d", "flagellum.1.length": 1.2, "duration": 1e-4, "frames": 20}),
+    ]
+
+
+def directories(parent: Path, count: int) -> list[Path]:
+    return [parent / f"{k:04d}" for k in range(count)]
+
+
+def alone(scene: Scene, directory: Path) -> Path:
+    """The single run of a member, with the kernels of a strict build."""
+    (outcome,) = run.start_batch([scene], [directory], "cpu", strict=True).execute_all(quiet=True)
+    assert outcome.status == "done"
+    return directory
+
+
+def test_every_member_is_its_own_single_run_to_the_last_bit(tmp_path):
+    scenes, made = members(), directories(tmp_path / "batch", 4)
+    batch = run.start_batch(scenes, made, "cpu", strict=True, movies=False)
+    assert [outcome.status for outcome in batch.execute_all(quiet=True)] == ["done"] * 4
+    for scene, directory in zip(scenes, made, strict=True):
+        assert_same_frames(alone(scene, tmp_path / scene.name), directory)
+        single, member = summary(tmp_path / scene.name), summary(directory)
+        for own in ("wall_time", "batch"):
+            single.pop(own), member.pop(own)
+        assert member == single
+        assert load(directory / "scene.toml") == scene
+        assert not (directory / "movie.usdc").exists() and (tmp_path / scene.name / "movie.usdc").exists()
+        with Record(directory) as record:
+            assert record.frame_count == scene.frames + 1 and record.scene_text == dumps(scene)
+            assert record.first_node[-1] == record.positions.shape[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_batch_that_is_ended_resumes_to_the_same_bits(number, tmp_path):
+    scenes, made = members(), directories(tmp_path / "batch", 4)
+    batch = run.start_batch(scenes, made, "cpu", strict=True, checkpoint_seconds=0.0)
+
+    def watch(reached: float) -> None:
+        if reached > 2.2e-4:
+            signal.raise_signal(number)
+
+    statuses = [outcome.status for outcome in batch.execute_all(quiet=True, watch=watch)]
+    ended = {signal.SIGTERM: "terminated", signal.SIGINT: "interrupted"}[number]
+    assert set(statuses) == {ended, "done"}  # the one of three frames is done by then
+    left = [path for path, status in zip(made, statuses, strict=True) if status != "done"]
+    resumed = run.resume_batch(left, device="cpu", strict=True)
+    assert min(resumed.simulation.times) > 0.0
+    assert {outcome.status for outcome in resumed.execute_all(quiet=True)} == {"done"}
+    for scene, directory in zip(scenes, made, strict=True):
+        assert_same_frames(alone(scene, tmp_path / scene.name), directory)
+
+
+def test_members_resume_from_different_frames(tmp_path):
+    """As after a kill between two members' checkpoints: each goes on from its own."""
+    scenes, made = members(), directories(tmp_path / "batch", 4)
+    batch = run.start_batch(scenes, made, "cpu", strict=True, checkpoint_seconds=0.0)
+
+    def watch(reached: float) -> None:
+        if reached > 1.5e-4:
+            signal.raise_signal(signal.SIGTERM)
+
+    batch.execute_all(quiet=True, watch=watch)
+    max(made[2].glob("checkpoint-*")).unlink()
+    resumed = run.resume_batch(made, device="cpu", strict=True)
+    resumed.execute_all(quiet=True)
+    for scene, directory in zip(scenes, made, strict=True):
+        assert_same_frames(alone(scene, tmp_path / scene.name), directory)
+
+
+def test_a_member_resumes_by_itself(tmp_path):
+    scenes, made = members()[:2], directories(tmp_path / "batch", 2)
+    batch = run.start_batch(scenes, made, "cpu", checkpoint_seconds=0.0)
+
+    def watch(reached: float) -> None:
+        if reached > 6e-5:
+            signal.raise_signal(signal.SIGTERM)
+
+    batch.execute_all(quiet=True, watch=watch)
+    assert run.resume(str(made[0])).execute(quiet=True).status == "done"
+    with Record(made[0]) as record:
+        assert record.frame_count == 9
+
+
+def test_a_member_that_a_guard_stops_leaves_the_others_running(tmp_path):
+    wild = small({"name": "wild", "numerics.stepper": "rkc", "motor.torque": 60.0})
+    weak = small({"name": "weak", "numerics.stepper": "rkc"})
+    made = directories(tmp_path / "batch", 3)
+    batch = run.start_batch([weak, wild, weak], made, "cpu", strict=True, movies=False)
+    outcomes = batch.execute_all(quiet=True)
+    assert [outcome.status for outcome in outcomes] == ["done", "stopped", "done"]
+    assert "wild: stopped at" in outcomes[1].message and "\n" not in outcomes[1].message
+    said = summary(made[1])
+    assert said["status"] == "stopped" and said["guards"]["violated"]["time"] > said["time"]
+    with Record(made[1]) as record:
+        assert 1 <= record.frame_count < 9
+    for directory in (made[0], made[2]):
+        assert_same_frames(alone(weak, tmp_path / f"alone-{directory.name}"), directory)
+
+
+def test_a_member_that_cannot_write_leaves_the_others_running(tmp_path):
+    scenes, made = members()[:3], directories(tmp_path / "batch", 3)
+    batch = run.start_batch(scenes, made, "cpu", movies=False, checkpoint_seconds=0.0)
+
+    def watch(reached: float) -> None:
+        if reached > 8e-5:
+            shutil.rmtree(made[1], ignore_errors=True)
+
+    outcomes = batch.execute_all(quiet=True, watch=watch)
+    assert [outcome.status for outcome in outcomes] == ["done", "failed", "done"]
+    assert "0001" in outcomes[1].message and "\n" not in outcomes[1].message
+    for k in (0, 2):
+        with Record(made[k]) as record:
+            assert record.frame_count == scenes[k].frames + 1
+
+
+def test_a_batch_of_other_terms_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="same terms"):
+        run.start_batch([small(), small({"steric.enabled": False})], directories(tmp_path / "batch", 2), "cpu")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("counts", [[11, 11], [9, 14, 6], [5]])
+def test_measures_of_many_cells_are_those_of_each(counts):
+    random = np.random.default_rng(len(counts))
+    first_node = np.concatenate([[0], np.cumsum(counts)])
+    shape = (7, first_node[-1], 3)
+    positions = 0.4 * random.standard_normal(shape) + np.arange(first_node[-1])[:, None] * [0.0, 0.0, 0.02]
+    directors = random.standard_normal(shape)
+    directors /= np.linalg.norm(directors, axis=-1, keepdims=True)
+    lengths = cells.bundle_lengths(positions, first_node)
+    assert lengths.tolist() == [observables.bundle_length(x, first_node) for x in positions]
+    assert len(counts) == 1 or len(set(lengths)) > 3
+    for part in (slice(0, 1), slice(2, 5)):  # the numbers of a cell do not depend on the others
+        assert np.array_equal(cells.bundle_lengths(positions[part], first_node), lengths[part])
+    if len(counts) > 1:
+        phases = cells.phase_differences(positions, directors, first_node)
+        each = [observables.phase_difference(x, e1, first_node) for x, e1 in zip(positions, directors, strict=True)]
+        np.testing.assert_allclose(phases, each, rtol=1e-14)
+        assert np.array_equal(cells.phase_differences(positions[3:4], directors[3:4], first_node), phases[3:4])
+
+
+def test_speeds_of_many_cells_are_those_of_each():
+    random = np.random.default_rng(1)
+    before, now = random.standard_normal((2, 5, 3))
+    first = random.standard_normal((5, 4))
+    second = first + 0.1 * random.standard_normal((5, 4))
+    speeds = cells.body_speeds(np.full(5, 2e-3), before, now, first, second)
+    times = np.array([0.0, 2e-3])
+    each = [
+        observables.body_speed(times, np.stack(x), np.stack(q))
+        for x, q in zip(zip(before, now, strict=True), zip(first, second, strict=True), strict=True)
+    ]
+    np.testing.assert_allclose(speeds, each, rtol=1e-13)
+
+
+def test_an_excluded_cell_stays_where_it_is():
+    batch = Simulation([small(), small({"motor.torque": 1.0})], device="cpu")
+    frames = batch.cell_frames()
+    next(frames), next(frames)
+    batch.exclude(0)
+    assert all(set(frame) == {1} for frame in frames)
+    assert batch.times[0] == pytest.approx(1e-5) and batch.times[1] == pytest.approx(8e-5)
+
+
+def test_frames_of_parts_fall_on_the_grid():
+    """Frames lie on multiples of the interval, also where runs end between them or the multiples round down."""
+    scene = small({"duration": 8e-5, "frames": 12})
+    whole = [frame.time for frame in Simulation(scene, device="cpu").frames(scene.duration)]
+    parts, simulation = [], Simulation(scene, device="cpu")
+    for until in (*(k * 8e-5 / 12 for k in range(1, 12)), 8e-5):
+        parts += [frame.time for frame in simulation.frames(until)]
+    assert parts == whole and len(whole) == 13
+    resumed = Simulation(scene, device="cpu")
+    resumed.restore(simulation.checkpoint())
+    assert list(resumed.frames(scene.duration)) == []
+
+
+def test_a_record_of_a_batch_keeps_no_file_open(tmp_path):
+    made = directories(tmp_path / "batch", 3)
+    batch = run.start_batch(members()[:3], made, "cpu", movies=False)
+    opened: set[str] = set()
+
+    def watch(reached: float) -> None:
+        paths = (str(path.resolve()) for path in Path("/proc/self/fd").iterdir() if path.exists())
+        opened.update(path for path in paths if path.endswith("run.h5"))
+
+    batch.execute_all(quiet=True, watch=watch)
+    assert opened == set()
+    assert len(arrays(made[0])["times"]) == 9

@@ -1,0 +1,121 @@
+"""Jobs on a cluster without one: what they are asked to run, and how a share ends when its time is over."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.runs import small
+from warpflag.run import sweep
+from warpflag.run.run_directory import RunError
+from warpflag.run.sweep import Sweep, slurm
+
+PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
+PATIENT = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(143)); time.sleep(60)"
+
+
+@pytest.fixture
+def started(tmp_path):
+    base = small({"duration": 4e-5, "frames": 4, "flagella.length": 1.0})
+    return sweep.start(Sweep(base, {"motor.torque": [1.0, 2.0, 3.0]}), str(tmp_path / "out"))
+
+
+def test_shares_of_a_script_cover_every_member(started, tmp_path):
+    """The script is run as Slurm would run it, one task after another."""
+    script = slurm.Jobs(started, 3600.0, count=2, device="cpu").script()
+    for task in ("0", "1"):
+        environment = {"PATH": "/usr/bin:/bin", "SLURM_ARRAY_TASK_ID": task, "PYTHONPATH": ":".join(sys.path)}
+        ended = subprocess.run(["bash"], input=script, text=True, capture_output=True, env=environment, cwd=tmp_path)
+        assert ended.returncode == 0, ended.stderr
+    assert started.statuses() == ["done"] * 3
+
+
+def test_members_are_cut_to_fit_the_wall_time(started, monkeypatch):
+    monkeypatch.setattr(type(started), "seconds_per_member", lambda *_: 100.0)
+    assert slurm.Jobs(started, 100.0).jobs() == 3
+    assert slurm.Jobs(started, 200.0).jobs() == 2
+    assert slurm.Jobs(started, 200.0, workers=2).jobs() == 1
+    assert slurm.Jobs(started, 3600.0, count=9).jobs() == 3  # never more than members
+
+
+@pytest.mark.parametrize(
+    "seconds, text", [(60, "00:01:00"), (61, "00:02:00"), (5400, "01:30:00"), (86400, "1-00:00:00"), (1, "00:01:00")]
+)
+def test_wall_times_are_whole_minutes_up(seconds, text):
+    assert slurm.slurm_time(seconds) == text
+
+
+def test_submitit_is_asked_for_by_name_where_it_is_absent(started, monkeypatch):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    with pytest.raises(RunError, match=r"warpflag\[slurm\]"):
+        slurm.Jobs(started, 3600.0, count=1).submit()
+
+
+def test_a_share_that_fails_is_a_failed_job():
+    assert slurm.Share((sys.executable, "-c", "raise SystemExit(3)"))() == 3  # guards stopped members: no failure
+    with pytest.raises(RuntimeError, match="status 1"):
+        slurm.Share((sys.executable, "-c", "raise SystemExit(1)"))()
+
+
+def test_a_share_ends_when_its_time_is_over_and_is_queued_again():
+    submitit = pytest.importorskip("submitit")
+    share, queued = slurm.Share((sys.executable, "-c", PATIENT)), []
+
+    def notice(*_):  # submitit's handler interrupts the call in the same thread
+        queued.append(share.checkpoint())
+
+    previous = signal.signal(signal.SIGALRM, notice)
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    began = time.monotonic()
+    try:
+        with pytest.raises(RuntimeError, match="status"):
+            share()
+    finally:
+        signal.signal(signal.SIGALRM, previous)
+    assert time.monotonic() - began < 30.0
+    assert isinstance(queued[0], submitit.helpers.DelayedSubmission)
+    assert queued[0].function == slurm.Share(share.command)
+
+
+def recipe(language: str, word: str) -> str:
+    """The block of code of the page that holds a word."""
+    blocks = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+    return next(block for block in blocks if word in block)
+
+
+def in_runs(started, tmp_path: Path) -> Path:
+    """The sweep at the place that the recipes name."""
+    (tmp_path / "runs").mkdir()
+    started.directory.rename(tmp_path / "runs" / "phases")
+    return tmp_path / "runs" / "phases"
+
+
+def test_the_dask_recipe_runs_a_sweep(started, tmp_path):
+    pytest.importorskip("distributed")
+    directory = in_runs(started, tmp_path)
+    text = recipe("python", "dask").replace("Client()", "Client(n_workers=1, threads_per_worker=1)")
+    (tmp_path / "recipe.py").write_text(text)
+    environment = {"PATH": "/usr/bin:/bin", "HOME": str(Path.home()), "PYTHONPATH": ":".join(sys.path)}
+    ended = subprocess.run(
+        [sys.executable, "recipe.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert sweep.resume(directory).statuses() == ["done"] * 3
+
+
+def test_the_snakemake_recipe_runs_a_sweep(started, tmp_path):
+    pytest.importorskip("snakemake")
+    directory = in_runs(started, tmp_path)
+    (tmp_path / "Snakefile").write_text(recipe("python", "rule all"))
+    path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
+    environment = {"PATH": path, "HOME": str(Path.home()), "PYTHONPATH": ":".join(sys.path)}
+    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--quiet"]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert sweep.resume(directory).statuses() == ["done"] * 3

@@ -1,0 +1,221 @@
+"""Sweeps: what they leave behind, and that it does not matter how often they are stopped."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py  # noqa: TID253 (no command line starts here)
+import numpy as np
+import pytest
+
+import warpflag
+from tests.runs import arrays, assert_same_frames, executed, small, summary
+from warpflag.record import Record
+from warpflag.run import sweep
+from warpflag.run.run_directory import RunError
+from warpflag.run.sweep import Sweep
+from warpflag.scene import dumps
+
+BASE = {"duration": 4e-5, "frames": 4, "flagella.length": 1.0}
+TORQUES = [1.0, 2.0, 3.0]
+
+
+def rows(directory: Path, name: str = "table.csv") -> list[dict[str, str]]:
+    with open(directory / name, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_sweep_leaves_a_run_per_member_and_a_table(tmp_path):
+    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+    outcome = started.execute(workers=2, quiet=True)
+    assert outcome.status == "done" and "3 members: 3 done" in outcome.message
+    table = rows(tmp_path / "out")
+    assert [(row["member"], float(row["motor.torque"]), row["status"]) for row in table] == [
+        (str(k), torque, "done") for k, torque in enumerate(TORQUES)
+    ]
+    for k, (row, member) in enumerate(zip(table, started.members, strict=True)):
+        directory = tmp_path / "out" / f"{k:04d}"
+        assert_same_frames(executed(member.scene, tmp_path / f"alone-{k}"), directory)
+        said = summary(directory)
+        assert float(row["rates.net_speed"]) == said["rates"]["net_speed"]
+        assert float(row["rates.motor_rate_lab.1"]) == said["rates"]["motor_rate_lab"][1]
+        assert float(row["rates.motor_rate_lab"]) == np.mean(said["rates"]["motor_rate_lab"])
+        assert row["events.zipped"] == "" and int(row["steps"]) == said["steps"]
+    with h5py.File(tmp_path / "out" / "table.h5") as file:
+        held = file["members"][:]
+    assert held["motor.torque"].tolist() == TORQUES and held["status"].tolist() == [b"done"] * 3
+    np.testing.assert_array_equal(held["rates.net_speed"], [float(row["rates.net_speed"]) for row in table])
+
+
+def test_pandas_reads_the_tables_in_one_line(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    plan = Sweep(small(BASE), {"motor.torque": [1.0]}, {"flagellum.torque": {"low": 1.0, "high": 2.0}}, repeats=2)
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    table = pandas.read_csv(tmp_path / "out" / "table.csv")
+    assert table["rates.net_speed"].dtype == float and len(table) == 2
+    held = pandas.DataFrame(h5py.File(tmp_path / "out" / "table.h5")["members"][:])
+    assert (held["rates.net_speed"] == table["rates.net_speed"]).all()
+
+
+def test_means_and_standard_errors_are_those_of_the_repeats(tmp_path):
+    plan = Sweep(
+        small(BASE), {"motor.axis_angle": [50, 60]}, {"flagellum.torque": {"low": 1.0, "high": 3.0}}, repeats=3
+    )
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    table, means = rows(tmp_path / "out"), rows(tmp_path / "out", "means.csv")
+    assert [(row["motor.axis_angle"], row["status"]) for row in means] == [("50", "3 of 3 done"), ("60", "3 of 3 done")]
+    for point, mean in enumerate(means):
+        speeds = np.array([float(row["rates.net_speed"]) for row in table if row["point"] == str(point)])
+        assert len(set(speeds)) == 3
+        assert float(mean["rates.net_speed"]) == pytest.approx(speeds.mean(), rel=1e-12)
+        error = np.sqrt(((speeds - speeds.mean()) ** 2).sum() / 2) / np.sqrt(3)
+        assert float(mean["rates.net_speed.error"]) == pytest.approx(error, rel=1e-12)
+        assert "flagellum.0.torque" not in mean  # it differs from repeat to repeat
+
+
+def test_what_is_done_is_not_run_again(tmp_path):
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    table = (tmp_path / "out" / "table.csv").read_bytes()
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("0*/*")}
+    removed = tmp_path / "out" / "0001"
+    kept = arrays(removed)
+    for path in removed.iterdir():
+        path.unlink()
+    removed.rmdir()
+    assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
+    after = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("0*/*")}
+    assert {path for path in before if before[path] != after[path]} == {p for p in before if p.parent == removed}
+    assert (tmp_path / "out" / "table.csv").read_bytes() == table
+    for name, values in kept.items():
+        np.testing.assert_array_equal(arrays(removed)[name], values)
+
+
+def test_a_member_that_a_guard_stops_is_reported_and_the_rest_done(tmp_path, capsys):
+    base = small({**BASE, "numerics.stepper": "rkc", "flagella.length": 2.0})
+    started = sweep.start(Sweep(base, {"motor.torque": [1.0, 60.0, 2.0]}), str(tmp_path / "out"))
+    outcome = started.execute(workers=1)
+    assert outcome.status == "stopped" and "2 done, 1 stopped" in outcome.message
+    assert started.statuses() == ["done", "stopped", "done"]
+    told = [line for line in capsys.readouterr().err.splitlines() if "stopped at" in line]
+    assert len(told) == 1 and "0001" in told[0] and "flagellum" in told[0]
+    assert [row["status"] for row in rows(tmp_path / "out")] == ["done", "stopped", "done"]
+    again = sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
+    assert again.status == "stopped"
+
+
+def test_a_member_whose_files_are_damaged_is_reported_and_the_rest_done(tmp_path):
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    for name in ("0000", "0002"):
+        (tmp_path / "out" / name / "summary.json").unlink()
+    (tmp_path / "out" / "0002" / "run.h5").write_bytes(b"no record")
+    outcome = sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
+    assert outcome.status == "failed" and "2 done" in outcome.message
+    assert [row["status"] for row in rows(tmp_path / "out")] == ["done", "done", "begun"]
+
+
+def test_a_member_of_another_scene_is_refused(tmp_path):
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    started = sweep.start(plan, str(tmp_path / "out"))
+    (tmp_path / "out" / "0001").mkdir()
+    (tmp_path / "out" / "0001" / "scene.toml").write_text(dumps(small({"motor.torque": 1.5})))
+    with pytest.raises(RunError, match="another scene"):
+        started.execute(workers=1, quiet=True)
+
+
+def test_shares_complete_each_other(tmp_path):
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    started = sweep.start(plan, str(tmp_path / "out"))
+    assert started.execute(workers=1, quiet=True, share=(0, 2)).status == "done"
+    assert started.statuses() == ["done", "missing", "done"]
+    assert started.execute(workers=1, quiet=True, share=(1, 2)).status == "done"
+    assert started.statuses() == ["done"] * 3
+
+
+SWEEP = """
+base = "base.toml"
+[axes]
+motor.torque = { from = 0.5, to = 3.0, count = 6 }
+"""
+
+
+def process(folder: Path, *arguments: str) -> subprocess.Popen:
+    root = Path(warpflag.__file__).parents[1]
+    paths = os.pathsep.join([str(root), str(root / "kernels")])
+    command = [sys.executable, "-m", "warpflag", "sweep", *arguments, "--workers", "2"]
+    return subprocess.Popen(
+        [*command, "--checkpoint-interval", "0.2"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def some_frames(folder: Path) -> bool:
+    """Whether some member has frames but is not done."""
+    return any(not (path.parent / "summary.json").exists() for path in folder.glob("out/0*/checkpoint-*"))
+
+
+def ended(folder: Path, number: int, *arguments: str) -> subprocess.Popen:
+    """A sweep that got a signal while some member was under way."""
+    started = process(folder, *arguments)
+    while not some_frames(folder) and started.poll() is None:
+        time.sleep(0.02)
+    started.send_signal(number)
+    return started
+
+
+def test_a_sweep_that_is_stopped_again_and_again_ends_as_if_it_never_was(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "base.toml").write_text(dumps(small({"duration": 0.02, "frames": 800})))
+        (tmp_path / folder / "sweep.toml").write_text(SWEEP)
+    undisturbed = process(tmp_path / "a", "sweep.toml", "-o", "out")
+    said, error = undisturbed.communicate()
+    assert undisturbed.returncode == 0, error
+    assert said.count("\n") == 1 and "6 members: 6 done" in said
+    arguments: tuple[str, ...] = ("sweep.toml", "-o", "out")
+    for number, status in ((signal.SIGKILL, -9), (signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGKILL, -9)):
+        stopped = ended(tmp_path / "b", number, *arguments)
+        error = stopped.communicate()[1]
+        assert stopped.returncode in (status, 0), error
+        if status > 0 and stopped.returncode:
+            assert "resumable with --resume out" in error.splitlines()[-1]
+        arguments = ("--resume", "out")
+    finished = {path: path.read_bytes() for path in (tmp_path / "b").glob("out/0*/summary.json")}
+    last = process(tmp_path / "b", *arguments)
+    assert last.wait() == 0, last.communicate()[1]
+    for path, content in finished.items():
+        if b'"done"' in content:
+            assert path.read_bytes() == content  # not repeated
+    assert (tmp_path / "a/out/table.csv").read_bytes() == (tmp_path / "b/out/table.csv").read_bytes()
+    for name in ("0000", "0005"):
+        assert_same_frames(tmp_path / "a/out" / name, tmp_path / "b/out" / name)
+
+
+def test_a_worker_that_dies_fails_its_batch_alone(tmp_path):
+    base = small({"duration": 0.02, "frames": 800})
+    (tmp_path / "base.toml").write_text(dumps(base))
+    (tmp_path / "sweep.toml").write_text(SWEEP)
+    started = process(tmp_path, "sweep.toml", "-o", "out")
+    while not some_frames(tmp_path) and started.poll() is None:
+        time.sleep(0.02)
+    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(started.pid)], capture_output=True, text=True)
+    os.kill(int(children.stdout.split()[0]), signal.SIGKILL)
+    error = started.communicate()[1]
+    assert started.returncode == 1, error
+    assert "its worker ended by signal 9" in error
+    statuses = [row["status"] for row in rows(tmp_path / "out")]
+    assert 3 <= statuses.count("done") < 6
+    assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
+    with Record(tmp_path / "out" / "0000") as record:
+        assert record.frame_count == 801

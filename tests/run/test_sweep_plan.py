@@ -1,0 +1,178 @@
+"""What a sweep file makes: its members, what is random in them, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from tests.runs import small
+from warpflag.model.geometry import initial_state
+from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, start
+from warpflag.scene import SceneError, dumps, load
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "base.toml").write_text(dumps(small()))
+    return tmp_path
+
+
+def members(folder, text: str, **options):
+    (folder / "sweep.toml").write_text(f'base = "base.toml"\n{text}')
+    return read(folder / "sweep.toml", **options).members()
+
+
+def test_members_are_all_combinations_in_order(folder):
+    text = '[axes]\nmotor.torque = [1.0, 2.0]\n"flagella.opening_angle" = { from = 40, to = 90, count = 3 }\n'
+    found = members(folder, text)
+    assert [tuple(m.values.values()) for m in found] == [(t, a) for t in (1.0, 2.0) for a in (40.0, 65.0, 90.0)]
+    assert [m.number for m in found] == [m.point for m in found] == list(range(6))
+    assert [m.scene.name for m in found][:2] == ["sweep-0000", "sweep-0001"]
+    assert (found[4].scene.motor.torque, found[4].scene.flagella.opening_angle) == (2.0, 65.0)
+    assert found[4].scene.flagella.length == 2.0  # the base's
+
+
+def test_the_command_line_replaces_axes_and_values(folder):
+    found = members(
+        folder,
+        "[axes]\nmotor.torque = [1.0, 2.0]\n",
+        overrides=["frames=4"],
+        grid=["motor.torque=3:4:2", "motor.axis_angle=30,40"],
+    )
+    assert [(m.scene.motor.torque, m.scene.motor.axis_angle) for m in found] == [(3, 30), (3, 40), (4, 30), (4, 40)]
+    assert {m.scene.frames for m in found} == {4}
+    scene = read(folder / "base.toml", grid=["hydrodynamics.mode=none,all"]).members()
+    assert [m.scene.hydrodynamics.mode for m in scene] == ["none", "all"]
+
+
+def test_a_sweep_is_written_and_read_back(folder):
+    text = (
+        "repeats = 2\n[set]\nfluid.viscosity = 2e-3\n[axes]\nmotor.torque = {from = 0.1, to = 0.7, count = 3}\n"
+        "hydrodynamics.mode = ['none', 'all']\n[random]\nseed = 3\ndraws = 2\nbody.length = {low = 2.0, high = 3.0}\n"
+        "flagellum.torque = {mean = 3.0, deviation = 0.2}\nanchors = {placement = 'random', least_distance = 0.3}\n"
+    )
+    found = members(folder, text)
+    assert len(found) == 3 * 2 * 2 * 2
+    sweep = read(folder / "sweep.toml")
+    again = folder / "again"
+    again.mkdir()
+    (again / "base.toml").write_text(sweep.base_text())
+    (again / "sweep.toml").write_text(sweep.dumps())
+    assert [m.scene for m in read(again / "sweep.toml").members()] == [m.scene for m in found]
+
+
+def test_draws_belong_to_points_and_spreads_to_repeats(folder):
+    text = (
+        "repeats = 3\n[axes]\nmotor.axis_angle = [40, 50]\n[random]\nseed = 1\ndraws = 4\n"
+        "fluid.viscosity = {low = 1e-3, high = 3e-3}\nflagellum.torque = {low = 1.0, high = 2.0}\n"
+    )
+    found = members(folder, text)
+    viscosities = np.array([m.scene.fluid.viscosity for m in found]).reshape(2, 4, 3)
+    torques = np.array([[own.torque for own in m.scene.flagellum] for m in found]).reshape(2, 4, 3, 2)
+    assert (viscosities[:, :, :1] == viscosities).all() and len(set(viscosities[0, :, 0])) == 4
+    np.testing.assert_array_equal(viscosities[0], viscosities[1])  # axes share their draws
+    assert len(set(torques[0].ravel())) == 24 and (torques[0] == torques[1]).all()
+    assert ((viscosities >= 1e-3) & (viscosities <= 3e-3)).all() and ((torques >= 1.0) & (torques <= 2.0)).all()
+    other = members(folder, text.replace("seed = 1", "seed = 2"))
+    assert all(a.scene.fluid.viscosity != b.scene.fluid.viscosity for a, b in zip(found, other, strict=True))
+    more = members(folder, text.replace("[random]\n", "[random]\nbody.length = {low = 2.0, high = 3.0}\n"))
+    assert [m.scene.fluid.viscosity for m in more] == [m.scene.fluid.viscosity for m in found]
+
+
+def test_normal_spreads_have_their_mean_and_deviation(folder):
+    text = "[set]\nflagella.count = 400\nsteric.enabled = false\n[random]\n"
+    text += "flagellum.torque = {mean = 3.0, deviation = 0.3}\n"
+    (only,) = members(folder, text)
+    torques = np.array([own.torque for own in only.scene.flagellum])
+    assert abs(torques.mean() - 3.0) < 5 * 0.3 / 20 and abs(torques.std() - 0.3) < 5 * 0.3 / math.sqrt(800)
+
+
+def test_random_anchors_keep_their_distances(folder):
+    text = (
+        "repeats = 2\n[set]\nflagella.count = 12\nbody.length = 6.0\n[random]\nseed = 5\n"
+        "anchors = {placement = 'random', least_distance = 0.4, clearance = 0.12, from = -1.0, to = 2.5}\n"
+    )
+    first, second = members(folder, text)
+    assert first.values != second.values
+    for member in (first, second):
+        specs = member.scene.resolved_flagella()
+        assert all(-1.0 <= spec.anchor_offset <= 2.5 for spec in specs)
+        for a, b in combinations(specs, 2):
+            turn = abs((a.azimuth - b.azimuth + 180) % 360 - 180)
+            assert math.hypot(math.radians(turn) * 0.4, a.anchor_offset - b.anchor_offset) >= 0.4
+        shapes = [nodes[1:] for nodes in initial_state(member.scene).positions]
+        for a, b in combinations(shapes, 2):
+            assert np.linalg.norm(a[:, None] - b, axis=-1).min() >= 0.12
+
+
+def test_even_and_given_anchors(folder):
+    (even,) = members(
+        folder, "[set]\nflagella.count = 40\n[random]\nanchors = {placement = 'even', from = -0.5, to = 0.5}\n"
+    )
+    offsets = np.array([own.anchor_offset for own in even.scene.flagellum])
+    np.testing.assert_allclose(np.diff(offsets), 1.0 / 40, rtol=1e-9)
+    np.testing.assert_allclose([offsets[0], offsets[-1]], [-0.4875, 0.4875])
+    azimuths = np.sort([own.azimuth for own in even.scene.flagellum])
+    assert np.diff([*azimuths, azimuths[0] + 360]).max() < 2 * 360 / 40  # all round the body
+    (given,) = members(folder, "[random]\nanchors = {placement = 'given', given = [[10, 0.1], [200, -0.2]]}\n")
+    assert [(own.azimuth, own.anchor_offset) for own in given.scene.flagellum] == [(10, 0.1), (200, -0.2)]
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("axis = 3\n", ["axis", "axes"]),
+        ("repeats = 0\n", ["repeats", "1 to"]),
+        ("repeats = 2\n[axes]\nmotor.torque = [1.0]\n", ["repeats", "again and again"]),
+        ("[axes]\nmotor.torque = []\n", ["motor.torque", "list of values"]),
+        ("[axes]\nmotor.torque = {from = 1, to = 2}\n", ["motor.torque", "count"]),
+        ("[axes]\nmotor.torque = {from = 1, to = inf, count = 3}\n", ["motor.torque"]),
+        ("[axes]\nmotor.torque = {from = 1, to = 2, count = 1.5}\n", ["motor.torque.count"]),
+        ("[random]\nseed = -1\n", ["random.seed"]),
+        ("[random]\ndraws = 0\n", ["random.draws"]),
+        ("[random]\nmotor.torque = {low = 3, high = 2}\n", ["random.motor.torque", "low"]),
+        ("[random]\nmotor.torque = {low = 3, hgh = 2}\n", ["random.motor.torque", "high"]),
+        ("[random]\nmotor.torque = {mean = 3, deviation = -1}\n", ["deviation"]),
+        ("[random]\nanchors = {placement = 'anywhere'}\n", ["random.anchors.placement", "even, given, random"]),
+        ("[random]\nanchors = {placement = 'random', distance = 1}\n", ["random.anchors", "least_distance"]),
+        ("[random]\nanchors = {placement = 'given', given = [[1, 0.1]]}\n", ["random.anchors.given", "2 pairs"]),
+        ("[random]\nanchors = {placement = 'random', least_distance = 9.0}\n", ["no place for flagellum 1"]),
+        ("[set]\nflagella.phase_difference = 0.5\n[random]\nanchors = {placement = 'random'}\n", ["phase_difference"]),
+    ],
+)
+def test_what_is_no_sweep_is_one_line(text, words, folder):
+    with pytest.raises((SceneError, BadMembers)) as refused:
+        members(folder, text)
+    line = str(refused.value)
+    assert "\n" not in line and all(word in line for word in words), line
+
+
+@pytest.mark.parametrize(
+    "argument", ["motor.torque", "motor.torque=", "motor.torque=1:2:x", "motor.torque=1:2:0", "=1:2:3"]
+)
+def test_a_malformed_grid_is_refused(argument):
+    with pytest.raises(SceneError, match="--grid"):
+        grid_axes([argument])
+
+
+def test_all_bad_members_are_named_before_anything_starts(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    text = 'base = "base.toml"\n[axes]\nmotor.torque = [1.0, 5e3, 2.0, "x"]\n'
+    (folder / "sweep.toml").write_text(text)
+    with pytest.raises(BadMembers) as refused:
+        start(read("sweep.toml"))
+    lines = str(refused.value).splitlines()
+    assert len(lines) == 2 and "member 0001: motor.torque = 5000.0" in lines[0] and "member 0003" in lines[1]
+    # Whether a shape begins inside the body is known only once it is made.
+    deep = Sweep(load("base.toml"), {"flagella.opening_angle": [90.0, 0.0], "flagella.anchor_offset": [0.6, -0.6]})
+    with pytest.raises(BadMembers, match="inside the body") as refused:
+        start(deep)
+    assert not (folder / "runs").exists()
+
+
+def test_a_mistyped_axis_is_named_with_what_was_meant(folder):
+    with pytest.raises(BadMembers, match=r"motor\.torqe.*did you mean motor\.torque"):
+        members(folder, "[axes]\nmotor.torqe = [1.0]\n")

@@ -1,0 +1,110 @@
+"""Figures of a sweep's table, made up: what they draw, how they are labelled, what they refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from warpflag import cli
+from warpflag.base.output import OutputError
+
+pytest.importorskip("matplotlib")
+
+from warpflag.view import sweep_figures
+
+
+def sweep(directory, axes: dict[str, list], rows: list[str], columns: str):
+    directory.mkdir()
+    lines = [f'"{key}" = {values}' for key, values in axes.items()]
+    (directory / "sweep.toml").write_text("[axes]\n" + "\n".join(lines) + "\n")
+    header = f"member,point,repeat,{','.join(axes)},status,{columns}"
+    (directory / "table.csv").write_text("\n".join([header, *rows]) + "\n")
+    return directory
+
+
+@pytest.fixture
+def line(tmp_path):
+    """Three torques, two repeats each; the last zips never, one repeat of the second neither."""
+    rows = ["0,0,0,1.0,done,10,0.004", "1,0,1,1.0,done,14,0.006", "2,1,0,2.0,done,20,0.003", "3,1,1,2.0,done,22,"]
+    rows += ["4,2,0,3.0,done,31,", "5,2,1,3.0,stopped,,"]
+    return sweep(tmp_path / "line", {"motor.torque": [1.0, 2.0, 3.0]}, rows, "rates.net_speed,events.zipped")
+
+
+@pytest.fixture
+def grid(tmp_path):
+    rows = [
+        f"{k},{k},0,{t},{m},done,{10 * t + i}"
+        for k, (t, i, m) in enumerate((t, i, m) for t in (10, 2, 3) for i, m in enumerate(("none", "all", "within")))
+    ]
+    return sweep(
+        tmp_path / "grid",
+        {"motor.torque": [10, 2, 3], "hydrodynamics.mode": ["none", "all", "within"]},
+        rows,
+        "rates.net_speed",
+    )
+
+
+def test_curves_show_means_and_standard_errors_of_the_repeats(line):
+    figure = sweep_figures.curves(sweep_figures.read(line))
+    speed, zipped = figure.axes
+    drawn, _, bars = speed.containers[0]
+    assert drawn.get_xydata().tolist() == [[1.0, 12.0], [2.0, 21.0], [3.0, 31.0]]
+    heights = [np.ptp(segment[:, 1]) for segment in bars[0].get_segments()]
+    assert heights == pytest.approx([2 * 2.0, 2 * 1.0, 0.0])  # the deviation over the root of two, each side
+    assert (speed.get_xlabel(), speed.get_ylabel()) == ("motor torque [pN µm]", "net speed [µm/s]")
+    points = zipped.containers[0][0].get_xydata()
+    np.testing.assert_allclose(points[:2], [[1.0, 5.0], [2.0, 3.0]])  # ms
+    assert np.isnan(points[2, 1]) and zipped.get_ylabel() == "zipped [ms]"
+
+
+def test_a_second_axis_makes_a_line_each(grid):
+    figure = sweep_figures.curves(sweep_figures.read(grid), numbers=["rates.net_speed"])
+    (panel,) = figure.axes
+    lines = [container[0].get_xydata().tolist() for container in panel.containers]
+    assert lines == [[[2, 20 + i], [3, 30 + i], [10, 100 + i]] for i in range(3)]
+    assert [text.get_text() for text in panel.get_legend().get_texts()] == ["mode none", "mode all", "mode within"]
+
+
+def test_a_map_has_its_axes_in_order(grid):
+    figure = sweep_figures.maps(sweep_figures.read(grid))
+    panel = figure.axes[0]
+    np.testing.assert_array_equal(panel.images[0].get_array(), [[20 + i, 30 + i, 100 + i] for i in range(3)])
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["2", "3", "10"]
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["none", "all", "within"]
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("motor torque [pN µm]", "hydrodynamics mode")
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--y", "rates.nothing"], ["no column rates.nothing", "rates.net_speed"]),
+        (["--x", "nothing"], ["no column nothing"]),
+        (["--y", "status"], ["does not hold numbers"]),
+        (["--as", "map"], ["takes two axes"]),
+        (["--as", "series"], ["is a sweep"]),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_line(arguments, words, line, capsys):
+    assert cli.main(["plot", str(line), "-o", str(line / "x.png"), *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(word in said for word in words), said
+    assert not (line / "x.png").exists()
+
+
+def test_the_command_draws_what_it_was_asked_for(line, grid, tmp_path, capsys):
+    for directory, more in ((line, []), (grid, []), (grid, ["--as", "curves"]), (line, ["--x", "events.zipped"])):
+        path = tmp_path / "figure.svg"
+        assert cli.main(["plot", str(directory), "-o", str(path), *more]) == 0
+        assert path.read_text().count("<svg") == 1
+        path.unlink()
+    assert cli.main(["plot", str(line), str(grid), "-o", str(tmp_path / "x.png")]) == 2
+    assert "draws one sweep" in capsys.readouterr().err
+
+
+def test_an_empty_or_missing_table_is_refused(line):
+    (line / "table.csv").write_text("member,status\n")
+    with pytest.raises(OutputError, match="no rows"):
+        sweep_figures.read(line)
+    (line / "table.csv").unlink()
+    with pytest.raises(OutputError, match=r"table\.csv: can't be read"):
+        sweep_figures.read(line)

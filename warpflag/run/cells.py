@@ -1,0 +1,123 @@
+"""The state of every cell of a simulation on the host, read with one copy of each array."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from warpflag_kernels.contact import pair_forces
+from warpflag_kernels.rod import elastic
+
+from warpflag.record.cell_state import CellState
+from warpflag.stepping import System
+
+__all__ = ["Cells", "CellsReader"]
+
+
+@dataclass(frozen=True)
+class Cells:
+    """All cells of a batch at one look, on the host, in lab coordinates.
+
+    Attributes:
+        time: [s], shape [cell_count].
+        step: steps taken, shape [cell_count].
+        positions: nodes [um], shape [node_count, 3], cell after cell, flagellum after flagellum.
+        directors: e1 of the tripods and the segments, shape [node_count, 3].
+        tangents: e3 of the tripods and the segments, shape [node_count, 3].
+        motor_angle: accumulated turn of each motor relative to its body [rad], shape [flagellum_count].
+        body_angle: accumulated turn of each body about its axis e_b3 [rad], shape [cell_count].
+        body_position: [um], shape [cell_count, 3].
+        body_orientation: quaternions (x, y, z, w), shape [cell_count, 4].
+        elastic_energy: bending, twist, stretching [pN um], shape [cell_count, 3].
+        steric_force: sum of the contact forces between flagella, each pair once [pN], shape [cell_count].
+        first_flagellum: cell c has the flagella first_flagellum[c] to first_flagellum[c + 1] - 1.
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1.
+    """
+
+    time: np.ndarray
+    step: np.ndarray
+    positions: np.ndarray
+    directors: np.ndarray
+    tangents: np.ndarray
+    motor_angle: np.ndarray
+    body_angle: np.ndarray
+    body_position: np.ndarray
+    body_orientation: np.ndarray
+    elastic_energy: np.ndarray
+    steric_force: np.ndarray
+    first_flagellum: np.ndarray
+    first_node: np.ndarray
+
+    def flagella(self, cell: int) -> slice:
+        """The flagella of one cell."""
+        return slice(int(self.first_flagellum[cell]), int(self.first_flagellum[cell + 1]))
+
+    def nodes(self, cell: int) -> slice:
+        """The nodes of one cell."""
+        own = self.flagella(cell)
+        return slice(int(self.first_node[own.start]), int(self.first_node[own.stop]))
+
+    def cell(self, cell: int) -> CellState:
+        """One cell by itself."""
+        flagella, nodes = self.flagella(cell), self.nodes(cell)
+        return CellState(
+            time=float(self.time[cell]),
+            step=int(self.step[cell]),
+            positions=self.positions[nodes],
+            directors=self.directors[nodes],
+            tangents=self.tangents[nodes],
+            motor_angle=self.motor_angle[flagella],
+            body_angle=float(self.body_angle[cell]),
+            body_position=self.body_position[cell],
+            body_orientation=self.body_orientation[cell],
+            elastic_energy=self.elastic_energy[cell],
+            steric_force=float(self.steric_force[cell]),
+        )
+
+
+class CellsReader:
+    """Reads the cells of a system.
+
+    Args:
+        system: what is advanced.
+        energy: scratch array of the elastic energy, shape [node_count, 3].
+        force: scratch array of the contact force, shape [node_count].
+    """
+
+    def __init__(self, system: System, energy: Any, force: Any) -> None:
+        self._system, self._energy, self._force = system, energy, force
+        data = system.model.data
+        self.first_flagellum, self.first_node = data.first_flagellum.numpy(), data.first_node.numpy()
+        self._first_node_of_cell = self.first_node[self.first_flagellum[:-1]]
+        self._cell_of_node = data.cell_of.numpy()
+
+    def read(self) -> Cells:
+        """All cells at the times that they have reached."""
+        system = self._system
+        model, state, chart, control = system.model, system.state, system.chart, system.control
+        elastic.elastic_energy(model, state, self._energy)
+        steric_force = np.zeros(model.cell_count)
+        if model.switches.has("steric"):
+            pair_forces.steric_magnitudes(model, state, self._force)
+            steric_force = 0.5 * self._sums(self._force)
+        centres = chart.base.body_position.numpy().copy()
+        return Cells(
+            time=control.time.numpy().copy(),
+            step=control.steps.numpy().copy(),
+            positions=chart.base.position.numpy().astype(np.float64) + centres[self._cell_of_node],
+            directors=chart.base.director.numpy().astype(np.float64),
+            tangents=chart.base.tangent.numpy().astype(np.float64),
+            motor_angle=chart.motor_angle.numpy().copy(),
+            body_angle=chart.body_angle.numpy().copy(),
+            body_position=centres,
+            body_orientation=chart.base.body_orientation.numpy().copy(),
+            elastic_energy=self._sums(self._energy),
+            steric_force=steric_force,
+            first_flagellum=self.first_flagellum,
+            first_node=self.first_node,
+        )
+
+    def _sums(self, values: Any) -> np.ndarray:
+        """The sum over the nodes of each cell, shape [cell_count, ...]; independent of the other cells to the bit."""
+        return np.add.reduceat(values.numpy().astype(np.float64), self._first_node_of_cell, axis=0)

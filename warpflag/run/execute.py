@@ -1,0 +1,238 @@
+"""What advances runs: one loop from frame to frame over the cells of a simulation, a run directory each."""
+
+from __future__ import annotations
+
+import functools
+import math
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from warpflag.base.progress import Progress
+from warpflag.record import RecordError
+from warpflag.record.reporters import versions
+from warpflag.run.faults import NumericalError
+from warpflag.run.member import Member, Outcome
+from warpflag.run.simulation import Simulation
+from warpflag.run.stop import Ended, Stop
+
+__all__ = ["Run"]
+
+_CHECKPOINT_SECONDS = 5.0
+_CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
+_SECONDS_PER_COPY = 0.05
+_WRITERS = 8
+_SECONDS_BEFORE_EXPLAINING = 2.0
+
+
+class Run:
+    """A simulation whose cells write a run directory each; made by `start`, `resume` and their batch forms.
+
+    Args:
+        simulation: None where there is nothing left to do.
+        members: the run of each cell.
+        movies: whether each run gets a movie at its end.
+        checkpoint_seconds: wall time between two checkpoints [s]; None: 5 s, more where they take long to write.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation | None,
+        members: Sequence[Member],
+        movies: bool = True,
+        checkpoint_seconds: float | None = None,
+    ) -> None:
+        self.members, self.movies = list(members), movies
+        self._given_interval = checkpoint_seconds
+        self._simulation = simulation
+        # The last copy of all cells at a frame, and when it was taken: what a checkpoint is written from.
+        self._copy: dict[str, np.ndarray] = {}
+        self._copied_at = -math.inf
+
+    @property
+    def simulation(self) -> Simulation:
+        """What advances the cells."""
+        assert self._simulation is not None
+        return self._simulation
+
+    def execute(self, quiet: bool = False, stop: Stop | None = None) -> Outcome:
+        """Runs a single scene to its end, or until a guard or a signal stops it; see `execute_all`."""
+        return self.execute_all(quiet, stop)[0]
+
+    def execute_all(
+        self,
+        quiet: bool = False,
+        stop: Stop | None = None,
+        watch: Callable[[float], None] | None = None,
+    ) -> list[Outcome]:
+        """Runs every member to the end of its scene; the directories are complete afterwards.
+
+        Args:
+            quiet: print nothing.
+            stop: what may end the run before its time; default: signals.
+            watch: called a few times a second with the simulated time that all members together have reached [s].
+
+        Returns:
+            How each member ended.
+        """
+        if stop is None:
+            with Stop() as own:
+                return self.execute_all(quiet, own, watch)
+        if self._simulation is not None:
+            self._execute(quiet, stop, watch)
+        return [member.outcome or Outcome("failed", "never ran") for member in self.members]
+
+    def _execute(self, quiet: bool, stop: Stop, watch: Callable[[float], None] | None) -> None:
+        progress = Progress(sum(member.scene.duration for member in self.members), quiet=quiet)
+        ended: Ended | None = None
+
+        def look() -> None:
+            reached = float(self.simulation.times.sum())
+            progress.update(reached)
+            if watch is not None:
+                watch(reached)
+            stop.check()
+
+        try:
+            stop.check()
+            self._prepare(quiet, stop)
+            look()
+            for cell, member in enumerate(self.members):
+                self._guarded(cell, lambda c=cell, m=member: m.start(self._first_node(c)))
+            self._record(look)
+        except KeyboardInterrupt as error:
+            ended = error if isinstance(error, Ended) else Ended("interrupted", "")
+        finally:
+            stop.at_once = False
+            progress.close()
+        if ended is not None:
+            self._end(ended)
+
+    def _prepare(self, quiet: bool, stop: Stop) -> None:
+        said = "warpflag: compiling kernels, once on each machine\n"
+        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, sys.stderr.write, [said])
+        if not quiet:
+            timer.start()
+        stop.at_once = True
+        try:
+            self.simulation.prepare()
+        except Exception:
+            stop.check()  # what a signal raises amid other code may come out as another error
+            raise
+        finally:
+            stop.at_once = False
+            timer.cancel()
+
+    def _record(self, look: Callable[[], None]) -> None:
+        given = self._given_interval
+        saved, interval = monotonic(), _CHECKPOINT_SECONDS if given is None else given
+        for frames in self.simulation.cell_frames(watch=look):
+            at_end = {
+                c for c, frame in frames.items() if self._guarded(c, lambda c=c, f=frame: self.members[c].write(f))
+            }
+            faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
+            if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):
+                self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
+            self._complete(sorted(at_end))
+            self._stop(faults)
+            if monotonic() - saved > interval:
+                began = monotonic()
+                self._save(range(len(self.members)))
+                saved = monotonic()
+                if given is None:
+                    interval = max(_CHECKPOINT_SECONDS, (saved - began) / _CHECKPOINT_SHARE)
+            look()
+        # Cells whose start violates a guard, and runs that were resumed at their end, have had no frame above.
+        self._copy = self.simulation.checkpoint()
+        faults = self.simulation.faults
+        self._stop(faults)
+        self._complete([c for c, member in enumerate(self.members) if member.outcome is None and c not in faults])
+
+    def _complete(self, cells: Sequence[int]) -> None:
+        """Ends members that have reached the end of their scenes."""
+        self._save(cells)
+        for cell in cells:
+            finish = functools.partial(self.members[cell].finish, "done", movie=self.movies)
+            self._guarded(cell, lambda c=cell, f=finish: f(self._facts(c)))
+
+    def _guarded(self, cell: int, action: Callable[[], Any]) -> Any:
+        """What a member does with its files; where the machine refuses, the member ends and the others go on."""
+        member = self.members[cell]
+        if member.outcome is not None:
+            return None
+        try:
+            return action()
+        except (OSError, RuntimeError, RecordError) as error:  # HDF5 raises all three
+            if isinstance(error, RecordError) and len(self.members) == 1:
+                raise
+            member.fail(error)
+            self.simulation.exclude(cell)
+            return None
+
+    def _stop(self, faults: Mapping[int, NumericalError]) -> None:
+        """Ends the members whose cells have violated a guard."""
+        for c, fault in faults.items():
+            member = self.members[c]
+            self._guarded(
+                c, lambda c=c, m=member, f=fault: m.finish("stopped", self._facts(c, f), f, movie=self.movies)
+            )
+
+    def _end(self, ended: Ended) -> None:
+        """Ends every member that still goes on, with a checkpoint to resume from."""
+        if self._copy:
+            self._save(range(len(self.members)))
+        for cell, member in enumerate(self.members):
+
+            def close(cell: int = cell, member: Member = member) -> None:
+                facts = self._facts(cell) if member.recorder.frame_count else {}
+                member.finish(ended.status, facts, ended=ended, movie=self.movies)
+
+            self._guarded(cell, close)
+
+    def _save(self, cells: Sequence[int]) -> None:
+        """Writes the checkpoints of members that still go on; disks take many at once faster than one by one."""
+
+        def save(cell: int) -> None:
+            copied = self.simulation.part(self._copy, cell)
+            self._guarded(cell, lambda: self.members[cell].save(copied, self.simulation.device.alias))
+
+        if len(cells) == 1:
+            save(cells[0])
+        elif cells:
+            with ThreadPoolExecutor(_WRITERS) as pool:
+                list(pool.map(save, cells))
+
+    def _first_node(self, cell: int) -> np.ndarray:
+        """Where each flagellum of a cell begins in its record, shape [flagellum_count + 1]."""
+        first = self.simulation.system.model.data.first_flagellum.numpy()
+        own = self.simulation.first_node[first[cell] : first[cell + 1] + 1]
+        return own - own[0]
+
+    def _facts(self, cell: int, fault: NumericalError | None = None) -> dict[str, Any]:
+        """What the summary says of the simulation, as of the last copy."""
+        simulation, scene = self.simulation, self.members[cell].scene
+        copied = simulation.part(self._copy or simulation.checkpoint(), cell)
+        violated = None
+        if fault:
+            place = {"flagellum": fault.flagellum, "segment": fault.segment}
+            violated = {"kind": fault.kind.name.lower(), "time": fault.time, **place}
+        return {
+            "scene": scene.name,
+            "duration": scene.duration,
+            "steps": copied["control.steps"][0],
+            "rejected_steps": copied["stepper.rejected"][0] if "stepper.rejected" in copied else 0,
+            "evaluations": copied["stepper.evaluations"][0],
+            "batch": len(self.members),
+            "guards": {"steps_between_checks": simulation.system.guard.interval.numpy()[cell], "violated": violated},
+            "precision": scene.numerics.precision,
+            "stepper": scene.numerics.stepper,
+            "device": simulation.device.alias,
+            "device_name": simulation.device.name,
+            "kernel_flags": simulation.system.model.precision.cpu_flags if simulation.device.is_cpu else "",
+            "versions": versions(),
+        }

@@ -1,0 +1,192 @@
+"""One run in its directory: the record that it writes, its checkpoints, and what it leaves at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from warpflag.record import RECORD_NAME, Frame, Record
+from warpflag.record.recorder import Recorder
+from warpflag.record.reporters import start_reporter, versions
+from warpflag.run import checkpoint
+from warpflag.run.faults import NumericalError
+from warpflag.run.lock import Lock
+from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, sync, write_whole
+from warpflag.run.stop import Ended
+from warpflag.run.summary import digest, plain
+from warpflag.scene import Scene
+
+__all__ = ["Member", "Outcome"]
+
+# HDF5 leaves a file that can't be opened when a write of its own fails, so the disk is looked at before: room for a
+# chunk of frames, twice, and for checkpoint and summary.
+_LEAST_ROOM = 1 << 18
+_FRAMES_OF_ROOM = 128
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Attributes:
+        status: done; stopped, by a guard; interrupted, by Ctrl-C; terminated, by a signal or the wall time; failed,
+            by the machine.
+        message: one line for the user.
+    """
+
+    status: str
+    message: str
+
+
+class Member:
+    """A run that writes its directory while a simulation advances its cell.
+
+    Args:
+        directory: of the run; it is locked.
+        scene: of the run.
+        lock: of the directory; released at the end.
+        resumed: the meta of the checkpoint that the run goes on from; None for a new run.
+        alone: whether it is the only run of its simulation: the file of its record then stays open.
+
+    Attributes:
+        outcome: how it ended; None while it goes on.
+    """
+
+    def __init__(
+        self, directory: Path, scene: Scene, lock: Lock, resumed: Mapping[str, Any] | None = None, alone: bool = True
+    ) -> None:
+        self.directory, self.scene = directory, scene
+        self.outcome: Outcome | None = None
+        self._lock = lock
+        self._saved_time = resumed["time"] if resumed else -1.0
+        self._began = monotonic() - (resumed["wall_time"] if resumed else 0.0)
+        buffered = {} if alone else {"block_frames": 64, "keep_open": False}
+        step = resumed["step"] if resumed else None
+        self.recorder = Recorder(directory / RECORD_NAME, resume_step=step, **buffered)
+
+    @property
+    def wall_time(self) -> float:
+        """Time that the run has taken, that before it was resumed included [s]."""
+        return monotonic() - self._began
+
+    def start(self, first_node: np.ndarray) -> None:
+        """Opens the record; flagellum k has the nodes first_node[k] to first_node[k + 1] - 1."""
+        start_reporter(self.recorder, self.scene, first_node)
+
+    def write(self, frame: Frame) -> bool:
+        """Records a frame; returns whether it was the last of the scene.
+
+        Raises:
+            OSError: the disk is all but full; what was recorded before still fits.
+        """
+        needed = _LEAST_ROOM + _FRAMES_OF_ROOM * (frame.positions.nbytes + frame.directors.nbytes)
+        if shutil.disk_usage(self.directory).free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.directory))
+        self.recorder.write(frame)
+        return self.recorder.frame_count == self.scene.frames + 1
+
+    def save(self, arrays: Mapping[str, np.ndarray], device: str) -> None:
+        """Writes a checkpoint, the frames before it first; the one of the last checkpoint's time is there already.
+
+        Args:
+            arrays: the checkpoint of the cell at one of its recorded frames.
+            device: that it was computed on.
+        """
+        step, time = int(arrays["control.steps"][0]), float(arrays["control.time"][0])
+        if time == self._saved_time:
+            return
+        meta = {
+            "step": step,
+            "time": time,
+            "wall_time": self.wall_time,
+            "device": device,
+            "dynamics_sha256": dynamics_sha256(self.scene),
+            "versions": versions(),
+        }
+        self.recorder.flush()
+        sync(self.recorder.path)
+        checkpoint.save(self.directory, arrays, meta)
+        self._saved_time = time
+
+    def finish(
+        self,
+        status: str,
+        facts: Mapping[str, Any],
+        fault: NumericalError | None = None,
+        ended: Ended | None = None,
+        movie: bool = True,
+    ) -> None:
+        """Closes the record and writes summary and movie.
+
+        Args:
+            status: as in `Outcome`.
+            facts: of the simulation, for the summary.
+            fault: the guard that was violated.
+            ended: what ended the run before its time.
+            movie: whether the movie is wanted; a run that will be resumed gets none.
+        """
+        try:
+            self.recorder.close()
+            message = self._written(status, facts, fault, ended, movie)
+        finally:
+            self._lock.release()
+        self.outcome = Outcome(status, f"{self.scene.name}: {message}")
+
+    def fail(self, error: Exception) -> None:
+        """Ends the run after the machine refused to write; what was committed stays."""
+        with contextlib.suppress(OSError, RuntimeError, ValueError):  # the same refusal once more
+            self.recorder.close()
+        self._lock.release()
+        name = getattr(error, "filename", None)
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        where = f"{name or self.directory}: {reason}"
+        self.outcome = Outcome("failed", f"{self.scene.name}: {where}; resumable with --resume {self.directory}")
+
+    def _written(
+        self,
+        status: str,
+        facts: Mapping[str, Any],
+        fault: NumericalError | None,
+        ended: Ended | None,
+        movie: bool,
+    ) -> str:
+        """Summary and movie of the record; returns what the user is told."""
+        how = status + (f" ({ended.reason})" if ended and ended.reason else "")
+        if self.recorder.frame_count == 0:
+            return f"{how} before the first frame; start again with --resume {self.directory}"
+        with Record(self.directory) as record:
+            found = digest(record, self.scene)
+            ending = {"status": status, "message": str(fault) if fault else "", "wall_time": self.wall_time}
+            summary = {**ending, **facts, **found}
+            write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
+            left_out = "" if not movie or ended is None else "; movie left out"
+            if movie and ended is None:
+                left_out = _movie(record, self.directory / MOVIE_NAME)
+        count = found["frames"]
+        reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
+        if status == "done":
+            return f"{reached} in {self.wall_time:.1f} s: {self.directory}{left_out}"
+        if status == "stopped":
+            return f"{fault}; {reached} kept in {self.directory}{left_out}"
+        return f"{how}, {reached} kept{left_out}; resumable with --resume {self.directory}"
+
+
+def _movie(record: Record, path: Path) -> str:
+    """Writes the movie; a signal meanwhile leaves it out, which is then said."""
+    from warpflag.view.usd import write_movie
+
+    try:
+        write_movie(record, path)
+    except KeyboardInterrupt:
+        return "; movie left out: warpflag export makes it"
+    return ""

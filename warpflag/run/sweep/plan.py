@@ -1,0 +1,243 @@
+"""What a sweep runs: a base scene, the axes of a grid, random draws and repeats, and the members that they make.
+
+A sweep file:
+
+    base = "zipping.toml"                 # from the folder of the sweep file
+    repeats = 1                           # of every point, with everything random drawn anew but the draws
+
+    [set]                                 # replaces values of the base
+    duration = 0.01
+
+    [axes]                                # all combinations
+    motor.torque = { from = 0.4, to = 3.4, count = 8 }
+    flagella.opening_angle = [23, 44, 90]
+
+    [random]
+    seed = 1
+    draws = 16                            # of every combination
+    fluid.viscosity = { low = 1e-3, high = 3e-3 }     # one value per draw, the same in its repeats
+    flagellum.torque = { mean = 3.4, deviation = 0.3 }  # one value per flagellum and repeat
+    anchors = { placement = "random", least_distance = 0.15 }
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpflag.run.sweep import draws
+from warpflag.scene import Scene, SceneError, dumps, load, with_values
+from warpflag.scene.errors import written
+from warpflag.scene.scene_file import nearest, read_overrides, read_toml
+
+__all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "grid_axes", "read"]
+
+BASE_NAME = "base.toml"
+_KEYS = ("base", "name", "repeats", "set", "axes", "random")
+_MOST_MEMBERS = 1_000_000
+
+
+class BadMembers(ValueError):
+    """Members that can't be simulated: one line each."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """One run of a sweep.
+
+    Attributes:
+        number: from 0; the name of its directory.
+        point: number of its combination of axes and draw; repeats share it.
+        repeat: from 0.
+        values: what it has of its own, by dotted key.
+        scene: to run.
+    """
+
+    number: int
+    point: int
+    repeat: int
+    values: dict[str, Any]
+    scene: Scene
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A base scene and what varies.
+
+    Attributes:
+        base: the scene that all members share but for their values.
+        axes: values by dotted key; the members are all combinations, the last axis fastest.
+        random: as the table [random] of a sweep file, dotted keys flat.
+        repeats: of every combination and draw.
+        name: of the sweep's directory.
+    """
+
+    base: Scene
+    axes: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    random: Mapping[str, Any] = field(default_factory=dict)
+    repeats: int = 1
+    name: str = ""
+
+    def members(self) -> list[Member]:
+        """Every member, in order.
+
+        Raises:
+            BadMembers: some scenes can't be simulated; one line for each.
+            SceneError: the sweep itself is not sound.
+        """
+        random = draws.Draws(self.random, self.base)
+        repeats = _count("repeats", self.repeats)
+        if repeats > 1 and not random.differs_in_repeats and not hasattr(self.base.fluid, "seed"):
+            problem = "would be the same run again and again: nothing is random in a repeat"
+            raise SceneError("repeats", repeats, problem, ["random"])
+        size = repeats * random.count * int(np.prod([len(values) for values in self.axes.values()], dtype=float))
+        if size > _MOST_MEMBERS:
+            raise SceneError("axes", list(self.axes), f"make {size} members; at most {_MOST_MEMBERS} are allowed")
+        members: list[Member] = []
+        bad: list[str] = []
+        width = max(4, len(str(size - 1)))
+        combinations = itertools.product(*self.axes.values())
+        for point, (combination, draw) in enumerate(itertools.product(combinations, range(random.count))):
+            for repeat in range(repeats):
+                number = point * repeats + repeat
+                axes = dict(zip(self.axes, combination, strict=True))
+                label = f"member {number:0{width}d}"
+                try:
+                    own = with_values(self.base, axes)
+                    values = axes | random.values(own, draw, repeat)
+                    scene = with_values(self.base, {**values, "name": f"{self.base.name}-{number:0{width}d}"})
+                except SceneError as error:
+                    bad.append(f"{label}: {error}")
+                    continue
+                members.append(Member(number, point, repeat, values, scene))
+        if bad:
+            raise BadMembers("\n".join(bad))
+        return members
+
+    def dumps(self) -> str:
+        """The sweep as TOML beside its base scene; a sweep read from it has the same members."""
+        lines = ["# A sweep of warpflag; its base scene lies beside it.", "", f"base = {written(BASE_NAME)}"]
+        lines += [f"name = {written(self.name or self.base.name)}", f"repeats = {self.repeats}", "", "[axes]"]
+        lines += [f"{written(key)} = {_inline(list(values))}" for key, values in self.axes.items()]
+        lines += ["", "[random]", *(f"{written(key)} = {_inline(value)}" for key, value in self.random.items())]
+        return "\n".join(lines) + "\n"
+
+    def base_text(self) -> str:
+        """The base scene as TOML."""
+        return dumps(self.base)
+
+
+def read(path: str | Path, overrides: Sequence[str] = (), grid: Sequence[str] = ()) -> Sweep:
+    """The sweep of a file; a scene file is a sweep without axes.
+
+    Args:
+        path: of a sweep file or a scene file.
+        overrides: "key=value" texts that replace values of the base scene.
+        grid: axes as in `grid_axes`; they replace those of the same key.
+
+    Raises:
+        SceneError: a file can't be read or holds what is not allowed.
+    """
+    path = Path(path)
+    table = read_toml(path)
+    try:
+        axes = grid_axes(grid)
+        if not {"base", "axes"} & table.keys():
+            base = load(path, overrides)
+            return Sweep(base, axes, name=base.name)
+        return _built(path, table, overrides, axes)
+    except SceneError as error:
+        raise (error if error.source else error.located(path)) from None
+
+
+def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes: Mapping[str, list[Any]]) -> Sweep:
+    for key in table.keys() - set(_KEYS):
+        near = nearest(key, _KEYS)
+        hint = f"did you mean {near}?" if near else "known here: " + ", ".join(_KEYS)
+        raise SceneError(key, table[key], f"unknown key; {hint}")
+    base = table.get("base")
+    if not isinstance(base, str):
+        raise SceneError("base", base, "must be the path of a scene file")
+    for key in ("set", "axes", "random"):
+        if not isinstance(table.get(key, {}), dict):
+            raise SceneError(key, table[key], f"must be a table [{key}]")
+    given = _flat(table.get("axes", {}))
+    found = {key: _axis(f"axes.{key}", values) for key, values in given.items()} | dict(axes)
+    name = table.get("name", path.stem)
+    if not isinstance(name, str):
+        raise SceneError("name", name, "must be a text")
+    scene = load(path.parent / base, {**_flat(table.get("set", {})), **read_overrides(overrides)})
+    scene = with_values(scene, {"name": name})
+    return Sweep(scene, found, _flat(table.get("random", {})), _count("repeats", table.get("repeats", 1)), name)
+
+
+def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
+    """Axes from the command line: "key=from:to:count", or "key=a,b,c".
+
+    Raises:
+        SceneError: an argument has another form.
+    """
+    axes = {}
+    for argument in arguments:
+        key, sign, text = argument.partition("=")
+        parts = text.split(":")
+        try:
+            if not sign or not key or len(parts) not in (1, 3):
+                raise ValueError
+            if len(parts) == 3:
+                table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
+                axes[key] = _axis(key, table)
+            else:
+                axes[key] = [read_overrides([f"{key}={item}"])[key] for item in text.split(",") if item]
+        except ValueError as error:
+            if isinstance(error, SceneError):
+                raise error.located("--grid") from None
+            problem = "must be written key=from:to:count or key=a,b,c"
+            raise SceneError(key, text, problem, source="--grid") from None
+        if not axes[key]:
+            raise SceneError(key, text, "has no values", source="--grid")
+    return axes
+
+
+def _axis(key: str, values: Any) -> list[Any]:
+    """The values of an axis: a list, or from, to and count."""
+    if isinstance(values, list) and values:
+        return values
+    if isinstance(values, dict) and values.keys() == {"from", "to", "count"}:
+        ends = [values["from"], values["to"]]
+        if all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
+            return [float(value) for value in np.linspace(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
+    raise SceneError(key, values, "must be a list of values, or { from = , to = , count = }")
+
+
+def _count(key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MOST_MEMBERS:
+        raise SceneError(key, value, f"must be a whole number, 1 to {_MOST_MEMBERS}")
+    return value
+
+
+_SPREAD_KEYS = {"from", "to", "low", "high", "mean", "deviation"}  # of a table that says what a value may be
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key: a table within is more of the key, unless it says which values are taken."""
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        key = prefix + name
+        inner = isinstance(value, dict) and key != "anchors" and not value.keys() & _SPREAD_KEYS
+        flat |= _flat(value, f"{key}.") if inner else {key: value}
+    return flat
+
+
+def _inline(value: Any) -> str:
+    """A value, list or table as TOML on one line."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_inline(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_inline(item) for item in value) + "]"
+    return written(value)

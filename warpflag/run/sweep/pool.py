@@ -1,0 +1,202 @@
+"""The workers of a sweep as seen from the sweep: processes that take batches one after another."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from warpflag.run.member import Outcome
+from warpflag.run.stop import Stop
+from warpflag.scene import Scene, dumps
+
+__all__ = ["Batch", "Pool"]
+
+_SECONDS_PER_LOOK = 0.1
+_COMMAND = [sys.executable, "-m", "warpflag.run.sweep.worker"]
+# A worker is one process of one thread; the libraries below NumPy would start one per core in each.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Members that one simulation advances.
+
+    Attributes:
+        members: their numbers.
+        directories: of their runs.
+        scenes: theirs.
+    """
+
+    members: Sequence[int]
+    directories: Sequence[Path]
+    scenes: Sequence[Scene]
+
+
+class _Worker:
+    """One worker: the process, and the thread that talks with it."""
+
+    def __init__(self, device: str) -> None:
+        self.device, self.reached = device, 0.0
+        self.thread: threading.Thread | None = None
+        self._started()
+
+    def _started(self) -> None:
+        # In a session of its own: Ctrl-C reaches the sweep alone, which then ends its workers in order.
+        self.process = subprocess.Popen(
+            _COMMAND,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            env={**_ONE_THREAD, **os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            start_new_session=True,
+        )
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        """The answer to a request; {"outcomes": None} where the process has ended."""
+        process = self.process
+        assert process.stdin is not None and process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(request) + "\n")
+            process.stdin.flush()
+            for line in process.stdout:
+                answer = json.loads(line)
+                if "reached" not in answer:
+                    return answer
+                self.reached = answer["reached"]
+        except (BrokenPipeError, ValueError):
+            pass
+        return {"outcomes": None}
+
+    def restart(self) -> str:
+        """Starts a process anew; returns how the one before it ended."""
+        status = self.process.wait()
+        self._started()
+        return f"its worker ended with status {status}" if status >= 0 else f"its worker ended by signal {-status}"
+
+    def close(self) -> None:
+        """Ends the process."""
+        process = self.process
+        if process.stdin is not None:
+            process.stdin.close()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+class Pool:
+    """Workers, one per device given; a `with` block starts and ends them.
+
+    Args:
+        devices: of the workers.
+        options: of the runs: movies and checkpoint_seconds.
+    """
+
+    def __init__(self, devices: Sequence[str], options: Mapping[str, Any]) -> None:
+        self.devices, self._options = list(devices), dict(options)
+        self._queue: queue.Queue[Batch] = queue.Queue()
+        self._finished: queue.Queue[tuple[Batch, list[Outcome]]] = queue.Queue()
+        self._open, self._done_time, self._ending = 0, 0.0, ""
+        self._workers: list[_Worker] = []
+        self._batch_ended = threading.Event()
+
+    def __enter__(self) -> Pool:
+        self._workers = [_Worker(device) for device in self.devices]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if not self.is_done:
+            self.end("terminated")
+        for worker in self._workers:
+            worker.close()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every batch that was submitted has been handed out by `finished`."""
+        return self._open == 0
+
+    @property
+    def reached(self) -> float:
+        """Simulated time that all members have reached [s]."""
+        return self._done_time + sum(worker.reached for worker in self._workers)
+
+    def measure(self, scenes: Sequence[Scene], stop: Stop) -> tuple[float, float]:
+        """Wall time per cell alone and in a batch [s], measured by the first worker on these scenes."""
+        stop.at_once = True
+        answer = self._workers[0].ask({"measure": [dumps(scene) for scene in scenes], "device": self.devices[0]})
+        stop.at_once = False
+        if "alone" not in answer:  # one by one, so that each member tells what is wrong
+            return 0.0, 0.0
+        return answer["alone"], answer["together"]
+
+    def submit(self, batch: Batch) -> None:
+        """Queues a batch; the workers begin with the first."""
+        self._open += 1
+        self._queue.put(batch)
+        for worker in self._workers:
+            if worker.thread is None:
+                worker.thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
+                worker.thread.start()
+
+    def finished(self) -> list[tuple[Batch, list[Outcome]]]:
+        """Batches that have ended since the last call, and how each of their members ended."""
+        found = []
+        while not self._finished.empty():
+            batch, outcomes = self._finished.get()
+            found.append((batch, outcomes))
+            self._done_time += sum(scene.duration for scene in batch.scenes)
+            self._open -= 1
+        return found
+
+    def wait(self) -> None:
+        """Waits for a moment, or until a batch has ended."""
+        self._batch_ended.wait(_SECONDS_PER_LOOK)
+        self._batch_ended.clear()
+
+    def end(self, status: str) -> None:
+        """Ends all workers resumable.
+
+        Args:
+            status: interrupted or terminated.
+        """
+        self._ending = status
+        number = signal.SIGINT if status == "interrupted" else signal.SIGTERM
+        for worker in self._workers:
+            worker.process.send_signal(number)
+        for worker in self._workers:
+            if worker.thread is not None:
+                worker.thread.join()
+
+    def _serve(self, worker: _Worker) -> None:
+        """Hands batches to a worker until none is left."""
+        while not self._ending:
+            try:
+                batch = self._queue.get(timeout=_SECONDS_PER_LOOK)
+            except queue.Empty:
+                continue
+            request = {
+                "directories": [str(directory) for directory in batch.directories],
+                "scenes": [dumps(scene) for scene in batch.scenes],
+                "device": worker.device,
+                "options": self._options,
+            }
+            outcomes = worker.ask(request)["outcomes"]
+            if outcomes is None and not self._ending:
+                outcomes = [["failed", worker.restart()]] * len(batch.members)
+            elif outcomes is None:
+                outcomes = [[self._ending, ""]] * len(batch.members)
+            worker.reached = 0.0
+            self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes]))
+            self._batch_ended.set()

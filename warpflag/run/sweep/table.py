@@ -1,0 +1,143 @@
+"""The table of a sweep: a row per member, and means over its repeats; as CSV and in HDF5."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpflag.base.output import whole
+from warpflag.run.run_directory import SCENE_NAME, SUMMARY_NAME
+
+__all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "summary_of", "write"]
+
+TABLE_NAME, MEANS_NAME, HDF5_NAME = "table.csv", "means.csv", "table.h5"
+# Of a summary; what the machine took for it is no result.
+_NUMBERS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events")
+
+
+def summary_of(directory: Path) -> dict[str, Any]:
+    """The summary of a run directory; empty where there is none."""
+    try:
+        summary = json.loads((directory / SUMMARY_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return summary if isinstance(summary, dict) else {}
+
+
+def status_of(directory: Path) -> str:
+    """The status of a member: that of its summary, "begun" before there is one, "missing" before it began."""
+    begun = "begun" if (directory / SCENE_NAME).exists() else "missing"
+    return str(summary_of(directory).get("status", begun))
+
+
+def write(directory: Path, members: Sequence[Any], names: Sequence[str]) -> None:
+    """Writes table.csv, means.csv where there are repeats, and table.h5 with both.
+
+    Args:
+        directory: of the sweep.
+        members: of the sweep, as `Sweep.members` gives them.
+        names: of the members' directories.
+    """
+    rows = [_row(member, directory / name) for member, name in zip(members, names, strict=True)]
+    columns = _columns(rows)
+    tables = {"members": (columns, rows)}
+    _write_csv(directory / TABLE_NAME, columns, rows)
+    if any(member.repeat for member in members):
+        varied = list(dict.fromkeys(key for member in members for key in member.values))
+        means = _means(rows, varied)
+        tables["means"] = (_columns(means), means)
+        _write_csv(directory / MEANS_NAME, *tables["means"])
+    _write_hdf5(directory / HDF5_NAME, tables)
+
+
+def _row(member: Any, directory: Path) -> dict[str, Any]:
+    summary = summary_of(directory)
+    row: dict[str, Any] = {"member": member.number, "point": member.point, "repeat": member.repeat, **member.values}
+    row["status"] = status_of(directory)
+    return row | _flat({name: summary[name] for name in _NUMBERS if name in summary})
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Numbers by dotted name; lists by index, and their mean under the name itself."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, list):
+            numbers = [math.nan if item is None else float(item) for item in value]
+            flat[f"{prefix}{name}"] = float(np.mean(numbers)) if numbers else math.nan
+            flat |= {f"{prefix}{name}.{k}": item for k, item in enumerate(numbers)}
+        else:
+            flat[f"{prefix}{name}"] = math.nan if value is None else value
+    return flat
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Every column that some row has; what varies stands before the status, numbers after it."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    before = dict.fromkeys(name for row in rows for name in list(row)[: list(row).index("status")] if "status" in row)
+    return [*before, *(name for name in names if name not in before)]
+
+
+def _means(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> list[dict[str, Any]]:
+    """A row per point: what its repeats share, how many are done, and mean and standard error of every number."""
+    points: dict[int, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        points.setdefault(row["point"], []).append(row)
+    numbers = [name for name in _columns(rows) if name not in ("member", "point", "repeat", "status", *varied)]
+    means = []
+    for point, repeats in points.items():
+        done = [row for row in repeats if row["status"] == "done"]
+        shared = {key: repeats[0][key] for key in varied if len({str(row.get(key)) for row in repeats}) == 1}
+        mean: dict[str, Any] = {"point": point, **shared, "status": f"{len(done)} of {len(repeats)} done"}
+        mean["count"] = len(done)
+        for name in numbers:
+            values = np.array([row[name] for row in done if name in row], dtype=float)
+            values = values[np.isfinite(values)]
+            mean[name] = float(values.mean()) if len(values) else math.nan
+            mean[f"{name}.error"] = float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
+        means.append(mean)
+    return means
+
+
+def _write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    with whole(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        for row in rows:
+            writer.writerow([_cell(row.get(name)) for name in columns])
+
+
+def _cell(value: Any) -> Any:
+    """A value as it stands in the file: what there is not is empty, numbers keep every digit."""
+    return "" if value is None or (isinstance(value, float) and math.isnan(value)) else value
+
+
+def _write_hdf5(path: Path, tables: Mapping[str, tuple[Sequence[str], Sequence[Mapping[str, Any]]]]) -> None:
+    """One compound dataset per table: numbers as float64, all else as text."""
+    import h5py
+
+    with whole(path) as temporary, h5py.File(temporary, "w") as file:
+        for name, (columns, rows) in tables.items():
+            kinds = [(column, _kind([row.get(column) for row in rows])) for column in columns]
+            table = np.zeros(len(rows), dtype=kinds)
+            for column, kind in kinds:
+                values = [row.get(column) for row in rows]
+                if kind is np.float64:
+                    table[column] = [math.nan if value is None else value for value in values]
+                else:
+                    table[column] = ["" if value is None else str(value) for value in values]
+            file[name] = table
+
+
+def _kind(values: Sequence[Any]) -> Any:
+    import h5py
+
+    numbers = all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values)
+    return np.float64 if numbers else h5py.string_dtype()

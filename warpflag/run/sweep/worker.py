@@ -1,0 +1,134 @@
+"""A worker of a sweep: a process that runs batches as they come on its standard input, and answers on its output.
+
+Requests and answers are JSON, one a line. A request is a batch: {"directories", "scenes" (TOML texts), "device",
+"options"}; {"measure": [TOML texts], "device"} asks what a cell costs alone and in a batch. Answers: {"reached"}
+while it runs [s], then {"outcomes": [[status, message], ...]}; or {"alone", "together"} [s]. At the end of its input,
+also when the process that started it is gone, the worker ends its batch resumable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+from pathlib import Path
+from time import monotonic, perf_counter
+from typing import Any, TextIO
+
+from warpflag.run import run
+from warpflag.run.faults import NumericalError
+from warpflag.run.member import Outcome
+from warpflag.run.run_directory import SCENE_NAME
+from warpflag.run.simulation import Simulation
+from warpflag.run.stop import Stop
+from warpflag.scene import Scene, loads
+
+__all__ = ["main"]
+
+_SECONDS_PER_REPORT = 0.2
+_SAMPLE_SECONDS = 0.3
+_FIRST_PART = 64  # of the simulated time is what is timed first
+
+
+def main() -> None:
+    """Answers requests until the input ends."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what libraries print does not get between the answers
+    requests: queue.Queue[dict[str, Any] | None] = queue.Queue()
+    threading.Thread(target=_listen, args=(sys.stdin, requests), daemon=True).start()
+    while (request := requests.get()) is not None:
+        with Stop() as stop:
+            try:
+                _answer(answers, _measured(request) if "measure" in request else _run(request, answers, stop))
+            except KeyboardInterrupt:
+                return
+            except (OSError, ValueError) as error:
+                message = " ".join(str(error).split())
+                _answer(answers, {"outcomes": [["failed", message]] * len(request.get("directories", [0]))})
+
+
+def _listen(stream: TextIO, requests: queue.Queue[dict[str, Any] | None]) -> None:
+    for line in stream:
+        requests.put(json.loads(line))
+    requests.put(None)
+    os.kill(os.getpid(), signal.SIGTERM)  # ends what is running; without a run, the process
+
+
+def _answer(answers: TextIO, answer: dict[str, Any]) -> None:
+    answers.write(json.dumps(answer) + "\n")
+    answers.flush()
+
+
+def _run(request: dict[str, Any], answers: TextIO, stop: Stop) -> dict[str, Any]:
+    """Runs a batch; where it can't begin together, each member by itself."""
+    directories = [Path(directory) for directory in request["directories"]]
+    scenes = [loads(text) for text in request["scenes"]]
+    reported = monotonic()
+
+    def watch(reached: float) -> None:
+        nonlocal reported
+        if monotonic() - reported > _SECONDS_PER_REPORT:
+            reported = monotonic()
+            _answer(answers, {"reached": reached})
+
+    def ended(batch: slice) -> list[Outcome]:
+        started = _started(directories[batch], scenes[batch], request)
+        return started.execute_all(quiet=True, stop=stop, watch=watch)
+
+    try:
+        outcomes = ended(slice(None))
+    except (OSError, ValueError) as error:
+        if len(scenes) == 1:
+            raise error
+        outcomes = []
+        for k in range(len(scenes)):
+            try:
+                outcomes += ended(slice(k, k + 1))
+            except (OSError, ValueError) as own:
+                outcomes.append(Outcome("failed", f"{scenes[k].name}: {' '.join(str(own).split())}"))
+    return {"outcomes": [[outcome.status, outcome.message] for outcome in outcomes]}
+
+
+def _started(directories: list[Path], scenes: list[Scene], request: dict[str, Any]) -> run.Run:
+    options = {"device": request["device"], **request["options"]}
+    if all((directory / SCENE_NAME).exists() for directory in directories):
+        return run.resume_batch(directories, **options)
+    return run.start_batch(scenes, directories, **options)
+
+
+def _measured(request: dict[str, Any]) -> dict[str, Any]:
+    """Wall time per cell of its start and of stepping through the whole scene, alone and in a batch [s]."""
+    scenes = [loads(text) for text in request["measure"]]
+    Simulation(scenes[0], device=request["device"]).prepare()  # loads the kernels
+    return {
+        "alone": _cost(scenes[:1], request["device"]),
+        "together": _cost(scenes, request["device"]),
+    }
+
+
+def _cost(scenes: list[Scene], device: str | None) -> float:
+    began = perf_counter()
+    simulation = Simulation(scenes, device=device)
+    simulation.prepare()
+    started = perf_counter() - began
+    # Advances that double until one is long enough to time: the first steps after a start are short ones.
+    reached, end = 0.0, min(scene.duration for scene in scenes)
+    until = end / _FIRST_PART
+    while True:
+        began = perf_counter()
+        with contextlib.suppress(NumericalError):
+            simulation.advance(until)
+        taken = perf_counter() - began
+        if taken > _SAMPLE_SECONDS or until >= end:
+            break
+        reached, until = until, min(2 * until, end)
+    stepping = taken / (until - reached) * max(scene.duration for scene in scenes)
+    return (started + stepping) / len(scenes)
+
+
+if __name__ == "__main__":
+    main()

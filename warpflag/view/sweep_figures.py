@@ -1,0 +1,267 @@
+"""Figures of a sweep, from its table: curves of numbers against one axis, or maps over two. Needs matplotlib."""
+
+from __future__ import annotations
+
+import csv
+import math
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpflag.base.output import OutputError
+from warpflag.observables.arrays import Array
+from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["DEFAULT_NUMBERS", "Table", "curves", "figure", "is_sweep", "maps", "read"]
+
+DEFAULT_NUMBERS = ("rates.net_speed", "rates.motor_rate_lab", "rates.body_rate", "events.zipped")
+_BEFORE_NUMBERS = ("member", "point", "repeat", "status", "count")
+# Units of a table's numbers and of a scene's values by the last part of their name, and what one is in that unit.
+_UNITS = {
+    "net_speed": ("µm/s", 1.0),
+    "body_speed": ("µm/s", 1.0),
+    "motor_rate": ("Hz", 1.0),
+    "motor_rate_lab": ("Hz", 1.0),
+    "body_rate": ("Hz", 1.0),
+    "zipped": ("ms", 1e3),
+    "synchronised": ("ms", 1e3),
+    "time": ("ms", 1e3),
+    "torque": ("pN µm", 1.0),
+    "opening_angle": ("deg", 1.0),
+    "axis_angle": ("deg", 1.0),
+    "viscosity": ("pN s/µm²", 1.0),
+    "length": ("µm", 1.0),
+    "anchor_offset": ("µm", 1.0),
+    "elastic_energy": ("pN µm", 1.0),
+    "steric_force_density": ("pN/µm", 1.0),
+    "wall_time": ("s", 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Table:
+    """The table of a sweep.
+
+    Attributes:
+        name: of the sweep's directory.
+        axes: dotted keys that the sweep varies along axes, in order.
+        columns: every column of the table as text, by name.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    columns: dict[str, list[str]]
+
+    def numbers(self, name: str) -> Array:
+        """A column as numbers, NaN where it is empty, shape [row_count].
+
+        Raises:
+            OutputError: there is no such column, or it does not hold numbers.
+        """
+        if name not in self.columns:
+            known = [column for column in self.columns if column not in _BEFORE_NUMBERS and not column[-1].isdecimal()]
+            raise OutputError(f"{self.name}: has no column {name}; it has {', '.join(known)}")
+        try:
+            return np.array([float(text) if text else math.nan for text in self.columns[name]])
+        except ValueError:
+            raise OutputError(f"{self.name}: column {name} does not hold numbers") from None
+
+    def levels(self, name: str) -> tuple[list[str], Array]:
+        """Values of an axis as text, each once in order of size, and which of them each row has."""
+        texts = self.columns[name]
+        try:
+            levels = sorted(set(texts), key=float)
+        except ValueError:
+            levels = list(dict.fromkeys(texts))
+        return levels, np.array([levels.index(text) for text in texts])
+
+
+def is_sweep(directory: str | Path) -> bool:
+    """Whether a directory holds a sweep."""
+    return (Path(directory) / "sweep.toml").is_file()
+
+
+def read(directory: str | Path) -> Table:
+    """The table of a sweep's directory.
+
+    Raises:
+        OutputError: it can't be read, or has no rows.
+    """
+    path = Path(directory) / "table.csv"
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+        axes = tomllib.loads((Path(directory) / "sweep.toml").read_text(encoding="utf-8")).get("axes", {})
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path}: can't be read: {' '.join(str(error).split())}") from None
+    if not rows:
+        raise OutputError(f"{path}: has no rows")
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
+    return Table(Path(directory).resolve().name, tuple(key for key in axes if key in columns), columns)
+
+
+def figure(
+    directories: Sequence[str | Path], kind: str | None = None, x: str | None = None, numbers: Sequence[str] = ()
+) -> Figure:
+    """The figure of a sweep that the command line asks for.
+
+    Args:
+        directories: that of one sweep.
+        kind: curves or map; None: a map of two numeric axes unless x is given, else curves.
+        x: as in `curves`.
+        numbers: as in `curves`.
+
+    Raises:
+        OutputError: there are several directories, the kind is one of runs, or there is no such column.
+    """
+    if len(directories) > 1:
+        raise OutputError(f"{directories[0]}: is a sweep; a figure draws one sweep")
+    if kind not in (None, "curves", "map"):
+        raise OutputError(f"{directories[0]}: is a sweep; it is drawn as curves or a map, not as a {kind}")
+    table = read(directories[0])
+    long = [axis for axis in table.axes if len(table.levels(axis)[0]) > 2]
+    if kind == "map" or (kind is None and x is None and len(long) > 1):
+        return maps(table, numbers)
+    return curves(table, x, numbers)
+
+
+@contextmanager
+def _style() -> Iterator[None]:
+    """The type sizes of print, for all that is drawn within."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise OutputError("figures need matplotlib: install warpflag with its extra, warpflag[plot]") from None
+    matplotlib.use("agg")
+    style: Any = STYLE
+    with matplotlib.rc_context(style):
+        yield
+
+
+@_style()
+def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> Figure:
+    """A panel per number against one column; mean and standard error where rows share it; a line per second axis.
+
+    Args:
+        table: of a sweep.
+        x: column of the abscissa; default: the first axis.
+        numbers: columns to draw; default: those of `DEFAULT_NUMBERS` that hold something.
+
+    Raises:
+        OutputError: there is no such column, or none with anything to draw.
+    """
+    x, numbers = _abscissa(table, x), _drawn(table, numbers)
+    position, others = table.numbers(x), [axis for axis in table.axes if axis != x]
+    lines, line_of = table.levels(others[0]) if others else ([""], np.zeros(len(position), dtype=int))
+    figure, panels = _panels(len(numbers))
+    for panel, name in zip(panels, numbers, strict=True):
+        values = _UNITS.get(_leaf(name), ("", 1.0))[1] * table.numbers(name)
+        for k, line in enumerate(lines):
+            places = np.unique(position[line_of == k])
+            rows = [values[(line_of == k) & (position == place) & np.isfinite(values)] for place in places]
+            means = [row.mean() if len(row) else math.nan for row in rows]
+            errors = [row.std(ddof=1) / math.sqrt(len(row)) if len(row) > 1 else 0.0 for row in rows]
+            label = f"{_leaf(others[0])} {_short(line)}".replace("_", " ") if others else None
+            color = COLORS[k % len(COLORS)]
+            panel.errorbar(places, means, errors, marker="o", markersize=3, capsize=2, color=color, label=label)
+        panel.set_xlabel(_label(x))
+        panel.set_ylabel(_label(name))
+    if others:
+        panels[0].legend()
+    return figure
+
+
+@_style()
+def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
+    """A map per number over the first two axes, means over what else varies; what there is not is left blank.
+
+    Args:
+        table: of a sweep with two axes.
+        numbers: as in `curves`.
+
+    Raises:
+        OutputError: there are not two axes, or there is no such column.
+    """
+    if len(table.axes) < 2:
+        raise OutputError(f"{table.name}: a map takes two axes, the sweep has {len(table.axes)}")
+    numbers = _drawn(table, numbers)
+    (first, columns), (second, rows) = (table.levels(axis) for axis in table.axes[:2])
+    figure, panels = _panels(len(numbers))
+    for panel, name in zip(panels, numbers, strict=True):
+        values = _UNITS.get(_leaf(name), ("", 1.0))[1] * table.numbers(name)
+        image = np.full((len(second), len(first)), math.nan)
+        for i in range(len(second)):
+            for j in range(len(first)):
+                found = values[(rows == i) & (columns == j) & np.isfinite(values)]
+                image[i, j] = found.mean() if len(found) else math.nan
+        drawn = panel.imshow(image, origin="lower", aspect="auto", cmap="viridis")
+        panel.set_facecolor("0.9")
+        panel.figure.colorbar(drawn, ax=panel, label=_label(name))
+        for ticks, labels, levels in (
+            (panel.set_xticks, panel.set_xticklabels, first),
+            (panel.set_yticks, panel.set_yticklabels, second),
+        ):
+            every = max(1, len(levels) // 6)
+            ticks(range(0, len(levels), every))
+            labels([_short(level) for level in levels[::every]])
+        panel.set_xlabel(_label(table.axes[0]))
+        panel.set_ylabel(_label(table.axes[1]))
+    return figure
+
+
+def _abscissa(table: Table, x: str | None) -> str:
+    if x is None and not table.axes:
+        raise OutputError(f"{table.name}: has no axis; name the column to draw against with --x")
+    return table.axes[0] if x is None else x
+
+
+def _drawn(table: Table, numbers: Sequence[str]) -> list[str]:
+    """The columns to draw."""
+    if numbers:
+        return list(numbers)
+    found = [name for name in DEFAULT_NUMBERS if name in table.columns and np.isfinite(table.numbers(name)).any()]
+    if not found:
+        raise OutputError(f"{table.name}: no member has anything to draw yet")
+    return found
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    from matplotlib import pyplot
+
+    columns = min(count, 2)
+    rows = -(-count // columns)
+    size = (COLUMN if columns == 1 else TWO_COLUMNS, 2.4 * rows)
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axis in axes.flat[count:]:
+        axis.remove()
+    return figure, list(axes.flat[:count])
+
+
+def _leaf(name: str) -> str:
+    parts: list[Any] = [part for part in name.split(".") if not part.isdecimal() and part != "error"]
+    return parts[-1]
+
+
+def _label(name: str) -> str:
+    """The name of a column in words, with its unit."""
+    words = " ".join(
+        part.replace("_", " ") for part in name.split(".") if part not in ("rates", "observables", "events")
+    )
+    unit = _UNITS.get(_leaf(name), ("", 1.0))[0]
+    return f"{words} [{unit}]" if unit else words
+
+
+def _short(text: str) -> str:
+    try:
+        return f"{float(text):.3g}"
+    except ValueError:
+        return text
