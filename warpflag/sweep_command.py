@@ -75,8 +75,9 @@ def sweep(options: argparse.Namespace) -> Outcome | str:
     Raises:
         OptionError: the options do not go together.
     """
-    if options.scene is None and options.set and "=" not in options.set[-1]:
-        options.scene = options.set.pop()  # sweep --set key=value SWEEP.toml
+    for values in (options.set, options.grid):  # sweep --set key=value SWEEP.toml
+        if options.scene is None and values and "=" not in values[-1]:
+            options.scene = values.pop()
     if (options.scene is None) == (options.resume is None):
         raise OptionError("sweep needs either a SWEEP.toml or --resume DIR")
     if options.resume is not None and (options.output or options.grid or options.set):

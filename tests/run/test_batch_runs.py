@@ -201,6 +201,7 @@ def test_frames_of_parts_fall_on_the_grid():
     assert list(resumed.frames(scene.duration)) == []
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="needs a list of the process's open files")
 def test_a_record_of_a_batch_keeps_no_file_open(tmp_path):
     made = directories(tmp_path / "batch", 3)
     batch = run.start_batch(members()[:3], made, "cpu", movies=False)

@@ -135,8 +135,10 @@ class Pool:
     def measure(self, scenes: Sequence[Scene], stop: Stop) -> tuple[float, float]:
         """Wall time per cell alone and in a batch [s], measured by the first worker on these scenes."""
         stop.at_once = True
-        answer = self._workers[0].ask({"measure": [dumps(scene) for scene in scenes], "device": self.devices[0]})
-        stop.at_once = False
+        try:
+            answer = self._workers[0].ask({"measure": [dumps(scene) for scene in scenes], "device": self.devices[0]})
+        finally:
+            stop.at_once = False
         if "alone" not in answer:  # one by one, so that each member tells what is wrong
             return 0.0, 0.0
         return answer["alone"], answer["together"]
