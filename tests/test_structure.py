@@ -19,7 +19,10 @@ PYTHON = [
 # From the bottom up: a room imports from itself and from those before it.
 ROOMS = {
     "warpflag_kernels": ("base", "rod", "motor", "contact", "fluid", "stepping", "implicit"),
-    "warpflag": ("base", "scene", "record", "observables", "model", "stepping", "view", "run", "cli", "__main__"),
+    "warpflag": (
+        *("base", "scene", "record", "observables", "model", "stepping", "view", "run"),
+        *("sweep_command", "cli", "__main__"),
+    ),
 }
 
 

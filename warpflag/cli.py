@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, reason = getattr(error, "status", "interrupted"), getattr(error, "reason", "")
         return _say(status + (f" ({reason})" if reason else ""), _STATUS[status])
     except _bad_input() as error:  # after the interrupt, which may have come while these were being imported
-        return _say(str(_located(error, options)).replace("\n", "\nwarpflag: "), BAD_INPUT)
+        return _say(_located(error, options), BAD_INPUT)
     except OSError as error:
         return _say(f"{error.filename}: {error.strerror}" if error.filename else error, FAILED)
 

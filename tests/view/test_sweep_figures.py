@@ -81,7 +81,7 @@ def test_a_map_has_its_axes_in_order(grid):
         (["--x", "nothing"], ["no column nothing"]),
         (["--y", "status"], ["does not hold numbers"]),
         (["--as", "map"], ["takes two axes"]),
-        (["--as", "series"], ["is a sweep"]),
+        (["--as", "dashboard"], ["is a sweep"]),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(arguments, words, line, capsys):

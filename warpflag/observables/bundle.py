@@ -9,7 +9,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from warpflag.observables.arrays import Array, flagella
 
-__all__ = ["BUNDLE_DISTANCE", "STRAY", "ZIPPED", "bundle_length", "bundled_fraction", "bundled_nodes", "near_segments", "zip_time"]
+__all__ = [
+    "BUNDLE_DISTANCE",
+    "STRAY",
+    "ZIPPED",
+    "bundle_length",
+    "bundled_fraction",
+    "bundled_nodes",
+    "near_segments",
+    "zip_time",
+]
 
 BUNDLE_DISTANCE = 0.44
 """Twice the radius of the normal flagellar helix, 2R [um]: a node this near to another flagellum is bundled."""
