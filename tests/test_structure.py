@@ -246,4 +246,9 @@ def test_arguments_are_labelled_as_they_are_used():
                 if (position in written) != (labels[name] == "Out"):
                     said = "is written" if position in written else "is not written"
                     wrong.append(f"{stem}: {function.name}: {name} {said} and stands under {labels[name]}")
+            for argument in function.args.args:
+                kind = ast.unparse(argument.annotation) if argument.annotation else ""
+                label = labels[argument.arg]
+                if label == "" or (kind == "Model" and label != "Model") or (kind == "State" and label == "Model"):
+                    wrong.append(f"{stem}: {function.name}: {argument.arg}, a {kind}, stands under {label or 'nothing'}")
     assert wrong == []

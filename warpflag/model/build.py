@@ -83,7 +83,6 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
     m.rod.rest_strain = vectors(h[:, None] * np.array([g.intrinsic_curvature for g in group]))
 
     motor_axis, anchor = _attachment(scenes, flagella, owner)
-    m.motor.torque = reals([spec.torque for spec in flagella])
     m.motor.axis, m.motor.anchor = vectors(motor_axis), vectors(anchor)
 
     mobility = [filament_mobility(scenes[c], s.segment_length) for c, s in zip(owner, flagella, strict=True)]

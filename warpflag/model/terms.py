@@ -37,6 +37,11 @@ class SceneTerm:
     power: Callable[[Scene, Evaluation], float] | None = None
 
 
+def _fill_motor(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+    torques = [spec.torque for scene in scenes for spec in scene.resolved_flagella()]
+    data.motor.torque = wp.array(np.array(torques), dtype=precision.real, device=device)
+
+
 def _motor_power(scene: Scene, found: Evaluation) -> float:
     """Of T_m on each tripod and -T_m m on the body."""
     torques = np.array([spec.torque for spec in scene.resolved_flagella()])
@@ -70,7 +75,7 @@ def _several(scene: Scene) -> bool:
 
 
 SCENE_TERMS = (
-    SceneTerm("motor", lambda scene: True, power=_motor_power),
+    SceneTerm("motor", lambda scene: True, fill=_fill_motor, power=_motor_power),
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque),
     SceneTerm("steric", lambda scene: scene.steric.enabled and _several(scene)),

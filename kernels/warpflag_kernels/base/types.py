@@ -115,7 +115,7 @@ def structs(p: Precision) -> SimpleNamespace:
         pose: Pose
         active: wp.array(dtype=wp.int32)  # [C], 1: the cell takes part in this pass
         # Joint i couples segments i and i + 1: energy gradients with respect to the two segment vectors and spins.
-        joint_before: wp.array(dtype=vec3)  # [E] [pN]
+        joint_before: wp.array(dtype=vec3)  # [E] [pN]; of the hook with respect to the unit vector m [pN um]
         joint_after: wp.array(dtype=vec3)  # [E] [pN]
         joint_spin_before: wp.array(dtype=real)  # [E] [pN um]
         joint_spin_after: wp.array(dtype=real)  # [E] [pN um]

@@ -16,7 +16,7 @@ from warpflag_kernels.base.types import structs
 from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW, PARALLEL
 
 # Centre lines closer than this have no direction of their own [steric diameters]: the difference of two float32
-# positions of a few um is known to some 1e-6 um, a tenth of a per cent of this.
+# positions of a few um is known to some 1e-6 um, a fortieth of this (4e-5 um).
 TOUCHING = 1.0e-3
 _SLOPE_THERE = 26.0 * LINEAR_BELOW**-14 - 7.0 * LINEAR_BELOW**-8  # -dF/dr at LINEAR_BELOW in units of F_0/sigma
 

@@ -41,8 +41,8 @@ from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
 # Collocation point of a step that does not end at an output time, as a fraction of the step. The truncation error
-# falls with it as 3 theta^2 - 1, but stiff modes are damped less: by 0.67 a step at 0.8, by 0.84 at 0.75
-# (docs/numerics.md).
+# falls with it as 3 theta^2 - 1, but stiff modes die out more slowly: a step leaves 0.67 of them at
+# 0.8 and 0.84 at 0.75 (docs/numerics.md).
 THETA = 0.8
 # Error estimate over the mean predictor error of a cell's nodes, for theta = 1; measured. The mean is controlled,
 # since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
@@ -74,7 +74,7 @@ def struct(p: Precision) -> Any:
         predicted_displacement: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e| [um]
         trust: wp.array(dtype=wp.float64)  # 1 less the predictor error of the last step over its prediction, at least 0
         accepted: wp.array(dtype=wp.int32)
-        evaluations: wp.array(dtype=wp.int32)  # right-hand sides so far
+        evaluations: wp.array(dtype=wp.int32)  # steps attempted so far
 
     return Implicit
 

@@ -210,7 +210,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
     """Which cells are measured in this pass, into `measured` and `due`.
 
-    Those are the cells of three flagella or more, every few steps, and whenever a step has been rejected.
+    A cell is measured at each of its first steps, then every few steps (flexible cells of one or two flagella more
+    rarely), and whenever a step has been rejected.
 
     Args:
         model, state: of the batch.

@@ -34,7 +34,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def joint(model: Model, state: State, e: wp.int32, k: wp.int32):
-        """Joint e of flagellum k: after each of its segments but the last."""
+        """Energy gradients of the joint between segments e and e + 1 of flagellum k."""
         per_length = real(1.0) / model.rod.segment_length[k]
         t = state.pose.tangent[e]
         u = state.pose.tangent[e + 1]
@@ -199,7 +199,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def joint_gradients(model: DeviceModel, state: DeviceState) -> None:
-    """Energy gradients of every joint, into `joint_before/after` [pN] and `joint_spin_before/after` [pN um]."""
+    """Energy gradients of every joint, into `joint_before/after` [pN], of the hook's tripod [pN um], and
+    `joint_spin_before/after` [pN um]."""
     kernel = _kernels(model.precision).joint_gradients
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
 

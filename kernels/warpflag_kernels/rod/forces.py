@@ -1,7 +1,7 @@
 """Total force on every node and torque on every segment's spin: the sum of what the terms offer.
 
 Nothing is scattered: a node gathers from its two segments and from itself. On r_0, which belongs to the body, the
-entry holds what the anchor hands to the body.
+entry holds the force of the flagellum on the body at the anchor.
 """
 
 import functools
