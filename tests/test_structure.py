@@ -250,5 +250,7 @@ def test_arguments_are_labelled_as_they_are_used():
                 kind = ast.unparse(argument.annotation) if argument.annotation else ""
                 label = labels[argument.arg]
                 if label == "" or (kind == "Model" and label != "Model") or (kind == "State" and label == "Model"):
-                    wrong.append(f"{stem}: {function.name}: {argument.arg}, a {kind}, stands under {label or 'nothing'}")
+                    wrong.append(
+                        f"{stem}: {function.name}: {argument.arg}, a {kind}, stands under {label or 'nothing'}"
+                    )
     assert wrong == []

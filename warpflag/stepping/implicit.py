@@ -172,7 +172,7 @@ class ImplicitStepper:
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
         if self.stability is not None:
-            stability.schedule(model, state, i.evaluations, i.accepted, self.stability)
+            stability.schedule(model, state, i.evaluations, i.accepted, s.control.longest_step, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)
         inputs = [moved.last, moved.before, i, state.data, last, before, s.control]
         wp.launch(k.keep_bodies, model.cell_count, inputs=inputs, device=device)
@@ -231,7 +231,7 @@ class ImplicitStepper:
         model, state = self._system.model, self._system.state
         stability.measure(
             model, state, self.stiffness, self.band, self.law.gain, self._scratch.remaining,
-            self.stability, self.data.over_implicit,
+            self.stability, self.data.over_implicit, self._system.control.longest_step,
         )  # fmt: skip
 
     def restart(self) -> None:

@@ -7,10 +7,12 @@ kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matr
 product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
 
 The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
-in flexible crowds; where kappa is large, in stiff cells, the equations are solved with the full mobility (`krylov`).
+in flexible cells; where kappa is large, in stiff ones, the equations are solved with the full mobility (`krylov`).
+One or two flexible flagella need little more than the least w and are measured rarely.
 """
 
 import functools
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,7 +24,7 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.implicit import linear_system, linearised
 from warpflag_kernels.rod import chain_chart
 
-LEAST = 1.3  # least over-implicitness, and that of one or two flagella
+LEAST = 1.3  # least over-implicitness, enough for kappa up to 2.6
 OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
 # The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
 # approaches the eigenvalue from below.
@@ -30,13 +32,16 @@ LARGEST_FALL = 0.985
 MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST, the limit of stability: from there on the full mobility is solved with
-LARGE_KAPPA_OF_CROWDS = 3.7  # the same for three flagella or more: eight flexible ones reach 3.5
-FREE_ROD = (
-    4.730041  # first root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4)
-)
-RELAXED = 0.1  # of such a decay time: a crowd whose steps are longer counts as stiff, not as flexible
+LARGE_KAPPA_OF_FLEXIBLE = 3.7  # the same for flexible cells: eight flagella reach 3.5
+# First root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4).
+FREE_ROD = 4.730041
+RELAXED = 0.1  # decay times of that mode in a step from which a cell counts as stiff
+# Decay times of the longest stretching mode, at K pi^2/(gamma_par L^2), in the longest step, from which a cell counts
+# as stiff: two flagella of the default stiffness go through five.
+TIGHT = 10.0
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
-LONG_INTERVAL = 16  # the same for one or two flagella of small kappa
+LONG_INTERVAL = 32  # the same for one or two flexible flagella of small kappa
+FIRST_OF_FLEXIBLE = 8  # step after a start at which those are first measured
 
 
 @functools.cache
@@ -81,12 +86,48 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
-    long_interval = wp.constant(LONG_INTERVAL)
-    large_kappa, large_kappa_of_crowds = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_CROWDS))
+    long_interval, first_of_flexible = wp.constant(LONG_INTERVAL), wp.constant(FIRST_OF_FLEXIBLE)
+    large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
+    half_turn, tight = wp.constant(real(math.pi)), wp.constant(wp.float64(TIGHT))
     free_rod, relaxed = wp.constant(real(FREE_ROD**2)), wp.constant(wp.float64(RELAXED))
     least, most, share, fall = (
         wp.constant(wp.float64(x)) for x in (LEAST, MOST, OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL)
     )
+
+    @wp.func(module=module)
+    def rod_like(model: Model, c: wp.int32, step: wp.float64):
+        """Whether the longest bending mode of some flagellum relaxes within some ten steps."""
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            first = model.first_node[k]
+            h = model.rod.segment_length[k]
+            length = real(model.first_node[k + 1] - first - 1) * h
+            squared = free_rod / (length * length)
+            rate = model.rod.bending_rigidity[k] * h * model.drag.mobility_across[first + 1] * squared * squared
+            if step * wp.float64(rate) > relaxed:
+                return True
+            k += 1
+        return False
+
+    @wp.func(module=module)
+    def taut(model: Model, c: wp.int32, step: wp.float64):
+        """Whether the longest stretching mode of some flagellum, a half wave, relaxes within a tenth of a step."""
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            first = model.first_node[k]
+            h = model.rod.segment_length[k]
+            wave = half_turn / (real(model.first_node[k + 1] - first - 1) * h)
+            rate = model.rod.stretching_stiffness[k] * h * model.drag.mobility_along[first + 1] * wave * wave
+            if step * wp.float64(rate) > tight:
+                return True
+            k += 1
+        return False
+
+    @wp.func(module=module)
+    def weakly_coupled(model: Model, c: wp.int32, longest_step: wp.float64):
+        """Whether kappa is small at any time: one or two flagella that are flexible in the longest step."""
+        few = model.first_flagellum[c + 1] - model.first_flagellum[c] <= 2
+        return few and not rod_like(model, c, longest_step) and not taut(model, c, longest_step)
 
     @wp.kernel(module=module)
     def schedule(
@@ -96,15 +137,18 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
         steps: wp.array(dtype=wp.int32),
         accepted: wp.array(dtype=wp.int32),
+        longest_step: wp.array(dtype=wp.float64),
         # Out:
         stability: Stability,
     ):
         c = wp.tid()
         stability.active[c] = state.active[c]
         measured = int(0)
-        crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-        wait = wp.where(crowd or stability.kappa[c] > large_kappa, interval, long_interval)
-        due = steps[c] < first_measurements or steps[c] % wait == 0 or accepted[c] == 0
+        due = accepted[c] == 0
+        if weakly_coupled(model, c, longest_step[c]) and stability.kappa[c] <= large_kappa:
+            due = due or steps[c] % long_interval == first_of_flexible
+        else:
+            due = due or steps[c] < first_measurements or steps[c] % interval == 0
         if state.active[c] != 0 and due:
             measured = 1
             stability.due[0] = 1
@@ -148,21 +192,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
             e += 1
         stability.size[k] = total
 
-    @wp.func(module=module)
-    def rod_like(model: Model, c: wp.int32, step: wp.float64):
-        """Whether the longest bending mode of some flagellum relaxes within some ten steps."""
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            first = model.first_node[k]
-            h = model.rod.segment_length[k]
-            length = real(model.first_node[k + 1] - first - 1) * h
-            squared = free_rod / (length * length)
-            rate = model.rod.bending_rigidity[k] * h * model.drag.mobility_across[first + 1] * squared * squared
-            if step * wp.float64(rate) > relaxed:
-                return True
-            k += 1
-        return False
-
     @wp.kernel(module=module)
     def choose(
         # Model:
@@ -170,6 +199,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # State:
         answer: Increment,
         step: wp.array(dtype=wp.float64),
+        longest_step: wp.array(dtype=wp.float64),
         # Out:
         stability: Stability,
         over_implicit: wp.array(dtype=wp.float64),
@@ -187,16 +217,21 @@ def _kernels(p: Precision) -> SimpleNamespace:
             k += 1
         ratio = wp.sqrt(total)
         if wp.isfinite(ratio) and ratio > wp.float64(0.0):
-            stability.kappa[c] = ratio * over_implicit[c]
-            crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2 and not rod_like(model, c, step[c])
-            kappa = stability.kappa[c]
-            stability.strong[c] = wp.where(kappa > wp.where(crowd, large_kappa_of_crowds, large_kappa), 1, 0)
-            if stability.strong[c] != 0:
-                stability.any_strong[0] = 1
-            if crowd and stability.strong[c] == 0:
-                over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
-            else:
-                over_implicit[c] = least
+            weak = weakly_coupled(model, c, longest_step[c])
+            crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
+            flexible = weak or (crowd and not rod_like(model, c, step[c]))
+            kappa = ratio * over_implicit[c]
+            # Of cells measured rarely the first product only turns the probe: of a vector of any direction it tells
+            # nothing. The others are solved in full until their probe has turned.
+            if stability.kappa[c] > wp.float64(0.0) or not weak:
+                stability.strong[c] = wp.where(kappa > wp.where(flexible, large_kappa_of_flexible, large_kappa), 1, 0)
+                if stability.strong[c] != 0:
+                    stability.any_strong[0] = 1
+                if flexible and stability.strong[c] == 0:
+                    over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
+                else:
+                    over_implicit[c] = least
+            stability.kappa[c] = kappa
             scale = real(wp.float64(1.0) / ratio)
             stability.probe.body[c] = scale * answer.body[c]
             e = model.first_node[model.first_flagellum[c]]
@@ -207,19 +242,22 @@ def _kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(schedule=schedule, mask=mask, measure=measure, choose=choose)
 
 
-def schedule(model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, stability: Any) -> None:
+def schedule(
+    model: DeviceModel, state: DeviceState, steps: Any, accepted: Any, longest_step: Any, stability: Any
+) -> None:
     """Which cells are measured in this pass, into `measured` and `due`.
 
-    A cell is measured at each of its first steps, then every few steps (flexible cells of one or two flagella more
-    rarely), and whenever a step has been rejected.
+    A cell is measured at each of its first steps, then at every fourth, and whenever a step has been rejected; one or
+    two flexible flagella every 32 steps.
 
     Args:
         model, state: of the batch.
         steps: steps attempted by every cell so far, shape [cell_count].
         accepted: 1: the last one was accepted, shape [cell_count].
+        longest_step: [s], shape [cell_count]: a cell that is stiff in such steps is measured often.
         stability: struct `Stability`.
     """
-    inputs = [model.data, state.data, steps, accepted, stability]
+    inputs = [model.data, state.data, steps, accepted, longest_step, stability]
     wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
 
 
@@ -232,6 +270,7 @@ def measure(
     answer: Any,
     stability: Any,
     over_implicit: Any,
+    longest_step: Any,
 ) -> None:
     """One power iteration of the cells that are due, and their over-implicitness from it.
 
@@ -239,6 +278,7 @@ def measure(
         gain: g, shape [cell_count].
         answer: increment to work in; the forces of `state` are overwritten.
         over_implicit: shape [cell_count].
+        longest_step: as in `schedule`.
     """
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
@@ -246,5 +286,5 @@ def measure(
     linear_system.solve(model, state, band, answer)
     inputs = [model.data, answer, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
-    inputs = [model.data, answer, band.step, stability, over_implicit, state.data]
+    inputs = [model.data, answer, band.step, longest_step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)
