@@ -1,8 +1,8 @@
 """The command line: `warpflag run`, `sweep`, `check`, `plot`, `render`, `export`, `compile`, `devices`.
 
-Exit status: 0 done; 1 the machine failed the run (disk full, no permission); 2 bad input, a line for each problem; 3 a guard
-stopped the run; 130 interrupted by Ctrl-C, 143 terminated by a signal or out of wall time, both resumable. Everything
-heavy is imported by the command that needs it.
+Exit status: 0 done; 1 the machine failed the run (disk full, no permission); 2 bad input, a line for each problem; 3 a
+guard stopped the run; 130 interrupted by Ctrl-C, 143 terminated by a signal or out of wall time, both resumable.
+Everything heavy is imported by the command that needs it.
 """
 
 from __future__ import annotations
