@@ -66,7 +66,7 @@ def launched(
     with monkeypatch.context() as patch:
         own = plan(scene, "cpu")
         sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own, CONTACT_BLOCK))
-        sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
+        sim.system.control.between_steps.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:
             sim.stepper.stability.due.fill_(1)
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.add(kernel))

@@ -68,7 +68,7 @@ def launched(precision: str, stepper: str) -> set[Any]:
     values = {"numerics.stepper": stepper} | ({} if stepper == "euler" else {"numerics.accuracy": 1e-3})
     scene = with_values(spread(3, 10, precision), values)
     sim = Simulation(scene, plan=as_on_gpu(plan_of([scene], find_device("cpu"))))
-    sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
+    sim.system.control.between_steps.fill_(1)  # a pass between two steps has every kernel
     if stepper == "implicit":
         sim.stepper.stability.due.fill_(1)
     with collected() as kernels:

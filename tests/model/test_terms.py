@@ -41,7 +41,7 @@ def launches(scene: Scene, monkeypatch: pytest.MonkeyPatch, by_cells: bool = Fal
     kernels: list[Any] = []
     own = plan(scene, "cpu")
     sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own))
-    sim.system.control.at_rest.fill_(1)  # a pass between two steps has every kernel
+    sim.system.control.between_steps.fill_(1)  # a pass between two steps has every kernel
     with monkeypatch.context() as patch:
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.append(kernel))
         sim.stepper.launch_pass()

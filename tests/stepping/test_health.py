@@ -276,7 +276,7 @@ def seen(sim: Simulation, before: np.ndarray, after: np.ndarray, looked_at: floa
         search.find(s.model, s.state, s.state.data.pose, listed)
     place(sim, after)
     s.guard.position.assign(before.reshape(-1, 3))
-    for flags in (s.chart.commit, s.chart.rest):
+    for flags in (s.chart.commit, s.chart.at_start):
         flags.fill_(1)
     s.control.fault.fill_(NO_FAULT)
     health.check(s.model, s.state, s.chart, s.guard, s.control, listed)

@@ -196,7 +196,7 @@ class Simulation:
             return
         # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
         # changes nothing.
-        self.system.control.at_rest.fill_(1)
+        self.system.control.between_steps.fill_(1)
         self.stepper.launch_pass()
         with wp.ScopedCapture(device=self.device) as captured:
             wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
@@ -361,8 +361,8 @@ class Simulation:
         model, s, chart = self.system.model, self.system.state, self.system.chart
         self._reconstruct()
         launch_right_hand_side(model, s)
-        chart.rest.fill_(1)
+        chart.at_start.fill_(1)
         health.check(model, s, chart, self.system.guard, self.system.control)
-        chart.rest.zero_()
+        chart.at_start.zero_()
         s.data.active.zero_()
         self._checked = True

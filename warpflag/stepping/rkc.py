@@ -66,7 +66,7 @@ class RkcStepper:
         reconstruction.reconstruct(s.model, s.state, s.chart)
         launch_right_hand_side(s.model, s.state)
         # Most passes are stages inside a step: what happens between steps is not even launched there.
-        wp.capture_if(s.control.at_rest, self._launch_between_steps)
+        wp.capture_if(s.control.between_steps, self._launch_between_steps)
         comoving_chart.increment_rates(s.model, s.state, s.chart)
         rkc.end_pass(s.model, s.state, s.chart, s.control, self.data, self._euler)
         clock.count_pass(s.control, s.model.device)
@@ -83,7 +83,7 @@ class RkcStepper:
             comoving_chart.fit_flagellum_spin(s.model, s.state, s.chart)
 
     def restart(self) -> None:
-        restart_step_control(self.steps, np.zeros(len(self.steps.tolerance)))
+        restart_step_control(self.steps, np.zeros(len(self.steps.error_rate)))
         self.data.stage.fill_(-1)
         self.data.stages.fill_(1)
         self.data.probes_left.fill_(rkc.FIRST_PROBES)

@@ -33,7 +33,7 @@ def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     c.error_sum.zero_()
     c.error_time.zero_()
     c.rejected_error.zero_()
-    c.wanted_step.assign(np.where(c.tolerance.numpy() > 0.0, FIRST_STEP, fixed_start))
+    c.wanted_step.assign(np.where(c.error_rate.numpy() > 0.0, FIRST_STEP, fixed_start))
 
 
 STEP_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")

@@ -27,7 +27,7 @@ class Control:
     steps: wp.array(dtype=wp.int32)  # taken so far
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
-    at_rest: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
+    between_steps: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
     budget: wp.array(dtype=wp.int32)  # [1], passes left before the host reads the clocks
     proceed: wp.array(dtype=wp.int32)  # [1], the loop condition
 
@@ -54,7 +54,7 @@ def allocate(cell_count: int, device: Any) -> Control:
     c.time, c.target, c.longest_step, c.step = (wp.zeros(cell_count, dtype=wp.float64, device=device) for _ in range(4))
     c.steps = wp.zeros(cell_count, dtype=wp.int32, device=device)
     c.fault = wp.full(cell_count, NO_FAULT, dtype=wp.int32, device=device)
-    c.unfinished, c.at_rest, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4))
+    c.unfinished, c.between_steps, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4))
     return c
 
 
@@ -68,7 +68,7 @@ def _kernels() -> SimpleNamespace:
         # Out:
         control: Control,
     ):
-        control.at_rest[0] = 0
+        control.between_steps[0] = 0
         control.budget[0] = control.budget[0] - 1
         control.proceed[0] = wp.where(control.unfinished[0] > 0 and control.budget[0] > 0, 1, 0)
 

@@ -33,7 +33,7 @@ def struct(p: Precision) -> Any:
     class StepFlow:
         loaded: wp.array(dtype=wp.int32)  # [K], number of nodes that a contact may load
         start: wp.array(dtype=wp.int32)  # [K], slots of these nodes lie in [start, start + loaded)
-        rest: wp.array(dtype=wp.int32)  # [K], first slot of the flagellum's other nodes
+        first_other: wp.array(dtype=wp.int32)  # [K], first slot of the flagellum's other nodes
         node: wp.array(dtype=wp.int32)  # [E], node of a slot; a cell's slots begin where its elements do
         slot: wp.array(dtype=wp.int32)  # [E], slot of a node; -1: of r_0, which is not in the sum
         sum: PairSum  # by slot
@@ -123,13 +123,13 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
                 own = model.flagellum_of[flow.node[i]]
                 start = flow.start[own]
                 loaded = start + flow.loaded[own]
-                rest = flow.rest[own]
+                first_other = flow.first_other[own]
                 if wp.static(within):
                     add(model, flow, c, i, start, wp.min(loaded, stop))
-                    add(model, flow, c, i, rest, stop)
+                    add(model, flow, c, i, first_other, stop)
                 else:
                     add(model, flow, c, i, begin, wp.min(start, stop))
-                    add(model, flow, c, i, loaded, wp.min(rest, stop))
+                    add(model, flow, c, i, loaded, wp.min(first_other, stop))
             i += 1
 
     @wp.func(module=module)
@@ -152,14 +152,14 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
             else:
                 start = flow.start[k]
                 loaded = start + flow.loaded[k]
-                rest = flow.rest[k]
-                others = rest + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
+                first_other = flow.first_other[k]
+                others = first_other + model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
                 if wp.static(within):
                     u = gather_pairs(flow.sum, i, start + thread, wp.min(loaded, sources), radius)
-                    u += gather_pairs(flow.sum, i, rest + thread, wp.min(others, sources), radius)
+                    u += gather_pairs(flow.sum, i, first_other + thread, wp.min(others, sources), radius)
                 else:
                     u = gather_pairs(flow.sum, i, begin + thread, wp.min(start, sources), radius)
-                    u += gather_pairs(flow.sum, i, loaded + thread, wp.min(rest, sources), radius)
+                    u += gather_pairs(flow.sum, i, loaded + thread, wp.min(first_other, sources), radius)
                     u += gather_pairs(flow.sum, i, others + thread, sources, radius)
             if wp.static(threads > 1):
                 u = warp_sum(u, thread)
@@ -235,7 +235,7 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
                 unloaded += model.first_node[k + 1] - model.first_node[k] - 1 - flow.loaded[k]
             k += 1
         flow.start[own] = loaded
-        flow.rest[own] = unloaded
+        flow.first_other[own] = unloaded
         while e < end:
             slot = loaded
             if may_be_loaded(contacts_in, e, end):
@@ -284,7 +284,7 @@ def allocate(model: DeviceModel) -> Any:
     def zeros(count: int, dtype: Any) -> wp.array:
         return wp.zeros(count, dtype=dtype, device=device)
 
-    flow.loaded, flow.start, flow.rest = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
+    flow.loaded, flow.start, flow.first_other = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
     flow.node = zeros(model.element_count, wp.int32)
     flow.slot = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
     form = model.plan.step_pairs

@@ -32,7 +32,7 @@ def struct(p: Precision) -> Any:
         # Now.
         elapsed: wp.array(dtype=wp.float64)  # [C], time since the start of the step [s]
         commit: wp.array(dtype=wp.int32)  # [C], 1: the present pose becomes the start of the next step
-        rest: wp.array(dtype=wp.int32)  # [C], 1: the present pose is the start of a step (its increments vanish)
+        at_start: wp.array(dtype=wp.int32)  # [C], 1: the present pose is the start of a step (its increments vanish)
         flagellum_turn: wp.array(dtype=mat33)  # [K], Q
         increment: wp.array(dtype=vec4)  # [E], node x [um] and spin [rad]
         rate: wp.array(dtype=vec4)  # [E] [um/s, rad/s]
@@ -59,7 +59,7 @@ def allocate(model: DeviceModel) -> Any:
     chart.base.body_position, chart.base.body_orientation = zeros(cells, wp.vec3d), zeros(cells, wp.quatd)
     chart.flagellum_spin, chart.flagellum_turn = zeros(flagella, p.vec3), zeros(flagella, p.mat33)
     chart.elapsed = zeros(cells, wp.float64)
-    chart.commit, chart.rest = zeros(cells, wp.int32), zeros(cells, wp.int32)
+    chart.commit, chart.at_start = zeros(cells, wp.int32), zeros(cells, wp.int32)
     chart.increment, chart.rate = zeros(elements, p.vec4), zeros(elements, p.vec4)
     chart.body_increment, chart.body_rate = zeros(cells, vec6d), zeros(cells, vec6d)
     chart.motor_angle, chart.body_angle = zeros(flagella, wp.float64), zeros(cells, wp.float64)
@@ -174,7 +174,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
-        if state.active[c] == 0 or chart.rest[c] == 0:
+        if state.active[c] == 0 or chart.at_start[c] == 0:
             return
         # Least squares over node velocities relative to the anchor. Spins have a small weight: it keeps
         # the system regular for a straight rod, while spins that only relax do not distort the fit.

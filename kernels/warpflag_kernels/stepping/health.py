@@ -110,7 +110,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
         if chart.commit[c] == 0:
-            return chart.rest[c] != 0  # a start
+            return chart.at_start[c] != 0  # a start
         ends = advanced(control, c) >= control.target[c]
         return ends or (control.steps[c] + 1) % guard.interval[c] == 0
 

@@ -128,7 +128,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         j = rkc.stage[c]
         if j == 1:
             left = control.target[c] - control.time[c]
-            if steps.tolerance[c] > zero:
+            if steps.error_rate[c] > zero:
                 control.step[c] = next_step(steps, c, control.longest_step[c], left)
             else:
                 count = wp.max(wp.ceil(left / control.longest_step[c] - tolerance), one)
@@ -142,9 +142,9 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         s = rkc.stages[c]
         dt = control.step[c]
         chart.commit[c] = wp.where(j == s, 1, 0)
-        chart.rest[c] = wp.where(j == s or j == -1, 1, 0)
+        chart.at_start[c] = wp.where(j == s or j == -1, 1, 0)
         if j == s or j == -1:
-            control.at_rest[0] = 1
+            control.between_steps[0] = 1
         if j <= 0:
             chart.elapsed[c] = zero
             chart.body_increment[c] = vec6d(zero)
@@ -282,7 +282,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         if not accept(steps, c, control.step[c], error, noise, sound, True) and control.step[c] > smallest:
             control.fault[c] = no_fault
             chart.commit[c] = 0
-            chart.rest[c] = 0
+            chart.at_start[c] = 0
 
     @wp.kernel(module=module)
     def keep(
@@ -301,7 +301,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         e = begin
-        if chart.rest[c] != 0:
+        if chart.at_start[c] != 0:
             while e < end:
                 rkc.start_rate[e] = chart.rate[e]
                 e += 1
@@ -332,7 +332,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             return
         rkc.evaluations[c] += 1
         j = rkc.stage[c]
-        if chart.rest[c] != 0:
+        if chart.at_start[c] != 0:
             rkc.body_start_rate[c] = chart.body_rate[c]
             if chart.commit[c] != 0:
                 control.steps[c] += 1

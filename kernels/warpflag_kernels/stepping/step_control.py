@@ -5,8 +5,8 @@ what adds up over time is the level between the jumps. So the control follows an
 log(error/dt^3); a step that followed every fluctuation would be less accurate at the same cost.
 
 Errors of equal sign from step to step add up in proportion to the number of steps n, so one step may make the error
-tolerance dt. Independent ones add up as n^1/2, and one step may make tolerance (dt SPAN)^1/2. Which of the two holds is
-a property of the stepper.
+error_rate dt. Independent ones add up as n^1/2, and one step may make error_rate (dt SPAN)^1/2. Which of the two holds
+is a property of the stepper.
 """
 
 import functools
@@ -38,7 +38,7 @@ SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be solved here ends the cell's
 class StepControl:
     """Per cell [C]."""
 
-    tolerance: wp.array(dtype=wp.float64)  # error per simulated time [um/s]; 0: fixed step
+    error_rate: wp.array(dtype=wp.float64)  # allowed error per simulated time [um/s]; 0: fixed step
     wanted_step: wp.array(dtype=wp.float64)  # [s]
     error_sum: wp.array(dtype=wp.float64)  # exponentially weighted sum of dt log(error/dt^3)
     error_time: wp.array(dtype=wp.float64)  # the same of dt, the total weight [s]
@@ -54,7 +54,7 @@ def allocate(accuracies: Sequence[float], device: Any) -> StepControl:
         device: Warp's device.
     """
     cells, c = len(accuracies), StepControl()
-    c.tolerance = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
+    c.error_rate = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
     c.wanted_step, c.error_sum, c.error_time, c.rejected_error = (
         wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
     )
@@ -79,7 +79,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     @wp.func(module=module)
     def allowed(control: StepControl, c: wp.int32, dt: wp.float64):
         """Error that a step may make [um]."""
-        return control.tolerance[c] * scale * wp.pow(dt, power)
+        return control.error_rate[c] * scale * wp.pow(dt, power)
 
     @wp.func(module=module)
     def accept(
@@ -126,7 +126,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                         control.error_time[c] = wp.float64(0.0)
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
-                    best = wp.pow(safety * scale * control.tolerance[c] / level, root)
+                    best = wp.pow(safety * scale * control.error_rate[c] / level, root)
                     factor = wp.min(growth, wp.max(best, shortest) / dt)
         if good:
             control.rejected_error[c] = wp.float64(0.0)
