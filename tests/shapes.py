@@ -26,6 +26,17 @@ def helix(node_count, *, axis_offset=(0.0, 0.0, 0.0), phase=0.0, radius=0.22, pi
     return nodes + axis_offset, np.vstack([[1.0, 0.0, 0.0], directors])
 
 
+def bent_helix(node_count, *, bend, phase=0.0, radius=0.22, pitch=2.14, h=0.2):
+    """Nodes of a left-handed helix about an arc of radius `bend` in the xz plane, along z at the origin."""
+    contour = np.hypot(2 * np.pi * radius, pitch)
+    s = h * np.arange(node_count)
+    angle, along = phase - 2 * np.pi * s / contour, pitch * s / contour / bend
+    zero = np.zeros_like(s)
+    centre = bend * np.stack([1.0 - np.cos(along), zero, np.sin(along)], axis=-1)
+    inward = np.stack([np.cos(along), zero, -np.sin(along)], axis=-1)
+    return centre + radius * (np.cos(angle)[:, None] * inward + np.sin(angle)[:, None] * [0.0, 1.0, 0.0])
+
+
 def line(node_count, *, x=0.0, y=0.0, h=0.2, tilt=0.0):
     """Nodes of a straight line along z; tilt moves it along x by so much per unit of z."""
     z = h * np.arange(node_count)

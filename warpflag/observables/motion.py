@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from warpflag.base import rotations
 from warpflag.observables.arrays import Array, elapsed, flagella, unit
 from warpflag.observables.phase import segment_tangents
-from warpflag.observables.shape import helix_axis
+from warpflag.observables.shape import local_axes
 from warpflag.scene.resistance import SpheroidMobility, spheroid_mobility
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ __all__ = [
     "net_speed",
     "thrust",
 ]
+
+OUTER_PART = 1 / 3
+"""Where along a flagellum the part begins that turns about its own axis, free of the hook, as a fraction of it."""
 
 
 def body_speed(times: ArrayLike, body_positions: ArrayLike, body_orientations: ArrayLike) -> float:
@@ -124,9 +127,11 @@ def motor_axes(scene: Scene) -> Array:
 def helix_rate(times: ArrayLike, positions: ArrayLike, first_node: NDArray[np.integer]) -> Array:
     """Rotation rate of each flagellum about its own helix axis in the lab [Hz], shape [flagellum_count].
 
-    From one frame to the next, the rotation that takes the tangents of all segments onto the new ones with the
-    least squared error; its angles about the helix axis (away from the body, see `helix_axis`), summed. In a bundle
-    that axis is the bundle's. Right as long as a flagellum turns by less than half a turn between two frames.
+    The phase of a segment is the angle of its tangent about the axis of the turn of the helix around it, which bends
+    with the flagellum and moves with it. From one frame to the next the phase of all segments of the outer two thirds
+    grows by one angle, their mean weighted with the tangents' parts across the axes; these angles are summed. Seen
+    from the body along the flagellum, positive is clockwise (right-handed about the direction away from the body).
+    Right as long as a flagellum turns by less than half a turn between two frames.
 
     Args:
         times: of the frames [s], shape [frame_count], at least two.
@@ -140,11 +145,14 @@ def helix_rate(times: ArrayLike, positions: ArrayLike, first_node: NDArray[np.in
     rates = []
     for rows in flagella(first_node):
         tangents = segment_tangents(positions[:, rows])
-        axes = helix_axis(tangents)
-        left, _, right = np.linalg.svd(np.einsum("fia,fib->fab", tangents[1:], tangents[:-1]))
-        left[..., 2] *= np.linalg.det(left @ right)[:, None]  # a rotation, not a reflection
-        turns = rotations.vector_of_matrix(left @ right)
-        rates.append(np.vecdot(turns, unit(axes[1:] + axes[:-1])).sum() / (2 * np.pi * duration))
+        segments, axes = local_axes(tangents, from_fraction=OUTER_PART)
+        across = tangents[:, segments] - np.vecdot(tangents[:, segments], axes)[..., None] * axes
+        before, after, axis = across[:-1], across[1:], axes[1:]
+        # The minimal rotation that takes the axis before onto the axis after carries the tangents' parts along.
+        both = axes[:-1] + axis
+        before = before - (np.vecdot(axis, before) / (1.0 + np.vecdot(axes[:-1], axis)))[..., None] * both
+        turned = np.arctan2(np.vecdot(np.cross(before, after), axis).sum(-1), np.vecdot(before, after).sum(-1))
+        rates.append(turned.sum() / (2 * np.pi * duration))
     return np.array(rates)
 
 

@@ -17,6 +17,7 @@ __all__ = [
     "elastic_energy",
     "helix_axis",
     "helix_pitch",
+    "local_axes",
     "phase_velocity",
     "strain",
     "turns_about_axis",
@@ -96,6 +97,42 @@ def helix_axis(tangents: Array) -> Array:
     _, vectors = np.linalg.eigh(np.einsum("...ia,...ib->...ab", spread, spread))
     axis = vectors[..., 0]
     return axis * np.copysign(1.0, np.vecdot(axis, mean[..., 0, :]))[..., None]
+
+
+def local_axes(tangents: Array, from_fraction: float = 0.0) -> tuple[NDArray[np.integer], Array]:
+    """Axes of the single turns of a helix whose axis may be bent: `helix_axis` of the turn around each segment.
+
+    How many segments make a turn is their mean over segments and frames: a segment turns by the rotation that takes
+    its Frenet frame onto the next one's. Segments less than half a turn from the ends are left out; of a flagellum of
+    less than a turn there is one axis, that of the whole, for its middle segment.
+
+    Args:
+        tangents: unit tangents of the segments, shape [frame_count, segment_count, 3].
+        from_fraction: of the segments, where the part begins of which axes are asked for.
+
+    Returns:
+        numbers of the segments, shape [axis_count], and unit vectors away from the first segment, shape
+        [frame_count, axis_count, 3].
+    """
+    tangents = np.asarray(tangents, float)
+    count = tangents.shape[-2]
+    turn = min(count, max(3, round(min(count, _segments_per_turn(tangents)))))
+    begin = min(int(from_fraction * count), count - turn)
+    starts = np.arange(begin, count - turn + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(tangents, turn, axis=-2)[..., starts, :, :]
+    return starts + turn // 2, helix_axis(np.swapaxes(windows, -1, -2))
+
+
+def _segments_per_turn(tangents: Array) -> float:
+    """Segments in a turn of a helix, from the mean turn of the Frenet frame per segment; infinite for a line."""
+    binormals = np.cross(tangents[..., :-1, :], tangents[..., 1:, :])
+    length = np.linalg.norm(binormals, axis=-1, keepdims=True)
+    binormals = np.divide(binormals, length, out=np.zeros_like(binormals), where=length > 1e-12)
+    t = tangents[..., 1:, :]
+    frames = np.stack([t, np.cross(binormals, t), binormals], axis=-1)
+    cosine = (np.einsum("...ij,...ij", frames[..., 1:, :, :], frames[..., :-1, :, :]) - 1.0) / 2.0
+    angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)).mean()) if cosine.size else 0.0
+    return 2.0 * np.pi / angle if angle > 0.0 else float("inf")
 
 
 def helix_pitch(positions: Array) -> float:
