@@ -303,3 +303,9 @@ def test_a_stopped_run_keeps_its_frames(scene, capsys):
     assert said.out == "" and "flagellum" in line and "numerics.time_step" in line and "made" in line
     with Record("made") as record:
         assert record.frame_count >= 1
+
+
+def test_a_figure_needs_no_backend_of_the_notebook_it_was_asked_for_in(scene):
+    assert cli.main(["run", scene, "--quiet"]) == 0
+    drawn = command("plot", "runs/small", "-o", "x.png", env=os.environ | {"MPLBACKEND": "module://not_here.inline"})
+    assert (drawn.returncode, drawn.stdout, drawn.stderr) == (0, "x.png\n", "")

@@ -8,6 +8,7 @@ Everything heavy is imported by the command that needs it.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
@@ -289,6 +290,7 @@ def _scene(options: argparse.Namespace) -> Scene:
 
 
 def _plot(options: argparse.Namespace) -> int:
+    os.environ["MPLBACKEND"] = "agg"  # a notebook's own, which a command started there inherits, may not exist here
     from warpflag.view import figures, sweep_figures
 
     if sweep_figures.is_sweep(options.directories[0]):
@@ -310,7 +312,7 @@ def _render(options: argparse.Namespace) -> int:
     from warpflag.view.notes import can_write
     from warpflag.view.render import render
 
-    filmed_anew = options.color or options.follow or options.slow_down
+    filmed_anew = options.color or options.follow or options.slow_down is not None
     # Its pictures per second say how often the film looks at the movie, not how fast the movie plays.
     shot = _shot(options) if filmed_anew else None
     render(

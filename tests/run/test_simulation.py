@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -142,3 +144,16 @@ def test_a_batch_has_no_reporters_but_runs():
     simulation = Simulation(batch, device="cpu")
     simulation.run()
     assert simulation.cell_state(1).time == small().duration
+
+
+def test_simulations_in_threads_give_the_numbers_of_one_alone():
+    """A capture records what any thread launches, so threads take turns."""
+
+    def positions(_turn: int = 0) -> np.ndarray:
+        simulation = Simulation(small(), device="cpu")
+        simulation.run()
+        return simulation.state.positions
+
+    alone = positions()
+    for found in ThreadPoolExecutor(4).map(positions, range(8)):
+        np.testing.assert_array_equal(found, alone)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -112,6 +113,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
         (run, "p.gif", {"frames_per_second": 0.0}, "frames per second"),
         (run, "p.gif", {"snapshots": 3}, "for pictures"),
         (run, "p.png", {"snapshots": 0}, "snapshots 0"),
+        *((run, "p.png", {"times": [1e-4, t]}, "the movie has 0 to") for t in (math.nan, math.inf, -1e-6, 1e6)),
         (run, "p.png", {"snapshots": 900, "size": (64, 64)}, "do not fit"),
         (run / "movie.usdc", "p.png", {"shot": Shot()}, "movie.usdc"),
         (tmp_path / "junk.usdc", "p.png", {}, "junk.usdc"),
@@ -149,6 +151,8 @@ def test_the_command_draws(run, tmp_path, capsys, monkeypatch):
         (["-o", "p.tiff"], ".png"),
         (["-o", "p.png", "--device", "tpu"], "tpu"),
         (["-o", "p.png", "--color", "mood"], "curvature"),
+        (["-o", "p.png", "--slow-down", "0"], "slow down"),
+        (["-o", "p.png", "--times", "nan"], "times nan"),
     ):
         assert cli.main(["render", str(run), *wrong]) == 2
         said = capsys.readouterr()

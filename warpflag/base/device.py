@@ -5,11 +5,29 @@ from __future__ import annotations
 import functools
 import os
 import tempfile
-from typing import Any
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 from warpflag.base.streams import say
 
-__all__ = ["DeviceError", "find_device", "list_devices", "start_warp"]
+__all__ = ["LAUNCHING", "DeviceError", "alone", "find_device", "list_devices", "start_warp"]
+
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+LAUNCHING = threading.RLock()
+"""Held by the thread that launches kernels: a capture records what any thread launches meanwhile."""
+
+
+def alone(function: _F) -> _F:
+    """The function, called by one thread at a time: it launches kernels or captures them."""
+
+    @functools.wraps(function)
+    def called(*args: Any, **options: Any) -> Any:
+        with LAUNCHING:
+            return function(*args, **options)
+
+    return cast("_F", called)
 
 
 class DeviceError(ValueError):

@@ -15,7 +15,7 @@ from warpflag_kernels.rod import reconstruction
 from warpflag_kernels.stepping import health
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
-from warpflag.base.device import find_device
+from warpflag.base.device import LAUNCHING, alone, find_device
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.terms import supplied_power
@@ -56,6 +56,7 @@ class Simulation:
         NumericalError: from `advance`, `frames` and `run`, when a guard is violated.
     """
 
+    @alone
     def __init__(
         self,
         scenes: Scene | Sequence[Scene],
@@ -180,7 +181,7 @@ class Simulation:
             if not waiting.any():
                 return
             self._advance(np.where(waiting, durations * (k + 1) / counts, 0.0), watch)
-            before, self._framed = self._framed, self._reader.read()
+            before, self._framed = self._framed, self.cells()
             reached = waiting & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
             yield frames_of(self._framed, before, lengths, np.flatnonzero(reached))
 
@@ -188,6 +189,7 @@ class Simulation:
         """Advances a cell no further: `cell_frames` goes on with the others."""
         self._excluded[cell] = True
 
+    @alone
     def prepare(self) -> None:
         """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
         if not self._checked:
@@ -220,12 +222,14 @@ class Simulation:
         control, state = self.system.control, self.system.state.data
         self.prepare()
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
-        control.target.assign(until)
-        state.active.assign(waiting.astype(np.int32))
-        control.unfinished.fill_(int(waiting.sum()))
+        with LAUNCHING:
+            control.target.assign(until)
+            state.active.assign(waiting.astype(np.int32))
+            control.unfinished.fill_(int(waiting.sum()))
         while control.unfinished.numpy()[0] > 0:
-            control.budget.fill_(self._passes_per_replay)
-            control.proceed.fill_(1)
+            with LAUNCHING:
+                control.budget.fill_(self._passes_per_replay)
+                control.proceed.fill_(1)
             started = clock.perf_counter()
             self._replay()
             done = control.budget.numpy()[0] <= 0
@@ -252,6 +256,7 @@ class Simulation:
         for error in self.faults.values():
             raise error
 
+    @alone
     def cells(self) -> Cells:
         """All cells on the host, each at the time it has reached; valid after `advance`."""
         return self._reader.read()
@@ -260,11 +265,13 @@ class Simulation:
         """One cell on the host, at the time it has reached; valid after `advance`."""
         return self.cells().cell(cell)
 
+    @alone
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
         own = {name: array.numpy().copy() for name, array in self._carried().items()}
         return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
 
+    @alone
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes back what `checkpoint` gave, in a simulation of the same scenes.
 
@@ -302,6 +309,7 @@ class Simulation:
             carried["guard.position"] = self.system.guard.position
         return carried
 
+    @alone
     def evaluate(self, cell: int = 0) -> Evaluation:
         """Forces and velocities of one cell at its present state; advances nothing."""
         model, s = self.system.model, self.system.state
@@ -339,8 +347,9 @@ class Simulation:
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
-        while self.system.control.proceed.numpy()[0] > 0:
-            self.stepper.launch_pass()
+        with LAUNCHING:
+            while self.system.control.proceed.numpy()[0] > 0:
+                self.stepper.launch_pass()
 
     def _reconstruct(self) -> None:
         """Puts the evaluation point on the present state; every cell is active afterwards."""
@@ -350,6 +359,7 @@ class Simulation:
             array.zero_()
         reconstruction.reconstruct(self.system.model, s, chart)
 
+    @alone
     def _present_state(self) -> Cells:
         """The cells before any step, or after a state was set from outside."""
         self._reconstruct()

@@ -17,6 +17,7 @@ __all__ = ["FilamentMobility", "SpheroidMobility", "filament_mobility", "pair_ra
 
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _ZETA_3 = 1.2020569031595942
+_SOUND = 1 - 1e-9  # round-off of the condition that a pair radius was chosen by
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,12 @@ def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
     h = segment_length
     if scene.hydrodynamics.mode != "consistent":
         return FilamentMobility(1 / (parallel * h), 1 / (perpendicular * h), 1 / (rotation * h))
-    along, across = _slender_body(h, scene.flagella.filament_radius, pair_radius(scene))
+    a_pair = pair_radius(scene)
+    along, across = _slender_body(h, scene.flagella.filament_radius, a_pair)
+    # A pair radius of the scene's own may attract at contact; a node that moves against its force is never right.
+    if min(along, across) < (_SOUND * 2 / 3 * h / a_pair if scene.hydrodynamics.pair_radius is None else 1e-9):
+        problem = f"is too short beside a pair radius of {a_pair:.3g} um, as longer segments take in mode consistent"
+        raise SceneError("flagella.segment_length", h, problem, ["hydrodynamics.mode", "hydrodynamics.pair_radius"])
     scale = 1 / (4 * math.pi * scene.fluid.viscosity * h)
     return FilamentMobility(scale * along, scale * across, 1 / (rotation * h))
 

@@ -34,6 +34,7 @@ MOVIE_NAME = "movie.usdc"
 _THINNEST = 1.5  # pixels, least radius of a flagellum in a picture
 _LEGEND_ROOM = 30  # heights of a letter: a narrower picture has the scale bar only
 _GUTTER = 3  # pixels between the snapshots of a sheet
+_ROUNDING = 1e-6  # of a movie's time: a picture's may be this far outside
 
 
 @dataclass(frozen=True)
@@ -187,6 +188,11 @@ def _seconds_per_picture(renderer: Renderer, codes: Sequence[float]) -> float:
 
 def _snapshot_codes(film: Film, times: Sequence[float], snapshots: int | None) -> list[float]:
     """Time codes of the pictures that are asked for."""
+    first, last = film.time(film.start), film.time(film.end)
+    slack = _ROUNDING * (last - first)
+    for time in times:
+        if not first - slack <= time <= last + slack:
+            raise OutputError(f"times {1e3 * time:g}: the movie has {1e3 * first:g} to {1e3 * last:g} ms")
     if snapshots is None:
         return [film.code_at(time) for time in times] or [film.end]
     if snapshots < 1 or times:
