@@ -134,9 +134,12 @@ CONSTANTS = {
     "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
     "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
     "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), CONTACT_LAW),
-    "contact_loops.SETTLING": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), CONTACT_LAW),
+    "contact_loops.NEWTON_STEPS": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), CONTACT_LAW),
     "quasi_newton.KEPT": Constant(
-        "implicit.quasi_newton", (16, 2, 4, 8, 32), CONTACT_LAW, derived=lambda kept: {"SMALL": kept * (kept + 1)}
+        "implicit.quasi_newton",
+        (16, 2, 4, 8, 32),
+        CONTACT_LAW,
+        derived=lambda kept: {"SYSTEM_ENTRIES": kept * (kept + 1)},
     ),
     "quasi_newton.INDEPENDENT": Constant("implicit.quasi_newton", (0.1, 1e-4, 1e-2, 0.3, 0.6), CONTACT_LAW, SINGLE),
     "search.MARGIN": Constant(
@@ -145,10 +148,10 @@ CONSTANTS = {
     "contact_list.PER_NODE": Constant("contact.contact_list", (4, 1, 2, 8), ("crowd",)),
     "neighbours.SKIN": Constant("contact.neighbours", (0.1, 0.025, 0.05, 0.2, 0.4), TOUCHING),
     "plan.STORED_NODES": Constant("base.plan", (512, 0), ("contact", "crowd")),
-    "rotne_prager.BLOCK": Constant(
+    "rotne_prager.FLOAT32_TERMS": Constant(
         "fluid.rotne_prager", (64, 16, 32, 128, 256), ("free", "crowd"), (("pair_precision", "float32"),)
     ),
-    "rkc.SAFETY": Constant("stepping.rkc", (1.15, 0.9, 1.0, 1.05, 1.3), EXPLICIT, RKC),
+    "rkc.RADIUS_MARGIN": Constant("stepping.rkc", (1.15, 0.9, 1.0, 1.05, 1.3), EXPLICIT, RKC),
     "rkc.FIRST_PROBES": Constant("stepping.rkc", (40, 2, 5, 10, 80), EXPLICIT, RKC),
     "rkc.PROBE_SIZE": Constant(
         "stepping.rkc", (1e-3, 1e-5, 1e-4, 1e-2, 1e-1), EXPLICIT, (*RKC, *SINGLE), key="float32"

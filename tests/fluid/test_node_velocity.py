@@ -257,7 +257,7 @@ def test_pairs_in_float32_change_velocities_by_its_round_off(mode, form, device)
         start = shaken(scene, 4, node=0.002)
         sim = Simulation(own, device=device, starts=start, strict=form == "strict", plan=planned)
         state = sim.system.state
-        assert len(state.data.pose.position) > 2 * rotne_prager.BLOCK
+        assert len(state.data.pose.position) > 2 * rotne_prager.FLOAT32_TERMS
         found.append(sim.evaluate().velocities)
         assert all(a.numpy().dtype == real for a in (state.pairs.x, state.pairs.fz))
         assert state.data.velocity.numpy().dtype == np.float64

@@ -119,7 +119,7 @@ def coefficients(sim: Simulation, stages: int) -> tuple[np.ndarray, np.ndarray]:
     s.control.target.fill_(1.0)
     s.control.longest_step.fill_(1.0)
     s.state.data.active.fill_(1)
-    data.spectral_radius.fill_((stages - 1.5) * (stages - 0.5) / 1.54 / rkc.SAFETY)
+    data.spectral_radius.fill_((stages - 1.5) * (stages - 0.5) / 1.54 / rkc.RADIUS_MARGIN)
     rows, times = [], []
     for j in range(1, stages + 1):
         data.stage.fill_(j)

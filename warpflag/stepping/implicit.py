@@ -63,8 +63,8 @@ class Scratch:
         expected: the same, transported to the first pose.
         last_at_first, last_at_second: the last step's increment, transported to the first and the second pose.
         found: e as the first iteration left it, transported to the second pose.
-        free: solution of an iteration before the contacts answer.
-        solved: the same with their answer.
+        free: solution of an iteration before the contact forces are solved for.
+        solved: the same with the contact forces.
         total: the whole step.
         remaining: what of the step is left to go from the second pose.
         zero: an increment of zero.

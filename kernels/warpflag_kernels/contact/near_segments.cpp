@@ -13,13 +13,13 @@ for (int j = begin; j < end; ++j) {
     }
 }
 #else
-for (int b = begin; b < end; b += BLOCK) {
+for (int b = begin; b < end; b += TESTED_AT_ONCE) {
     unsigned hits = 0;
-    for (int l = 0; l < BLOCK; ++l) {
+    for (int l = 0; l < TESTED_AT_ONCE; ++l) {
         const float dx = x - X[b + l], dy = y - Y[b + l], dz = z - Z[b + l], reach = within + H[b + l];
         hits |= (unsigned)(dx * dx + dy * dy + dz * dz < reach * reach) << l;
     }
-    if (end - b < BLOCK) hits &= (1u << (end - b)) - 1u;
+    if (end - b < TESTED_AT_ONCE) hits &= (1u << (end - b)) - 1u;
     for (; hits; hits &= hits - 1) {
         if (found < SLOTS) S[found] = b + __builtin_ctz(hits);
         ++found;

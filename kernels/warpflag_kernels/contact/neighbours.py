@@ -22,7 +22,7 @@ CONTACT_REACH = (
 SKIN = 0.1  # [um]; at 6 mm/s, the fastest tips, a list serves 8 us
 SLOTS = 64  # room of a list, and bits of the mask in which a search marks its contacts
 SLACK = 1.1  # a segment is at most this times the longest one at the last check: twice the strain that guards allow
-BLOCK = 16  # segments that a CPU tests at once: one vector of float32
+TESTED_AT_ONCE = 16  # segments that a CPU tests at once: one vector of float32
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def struct(p: Precision) -> Any:
     class Neighbours:
         position: wp.array(dtype=vec3)  # [E], of the nodes when the lists were built [um]
         left: wp.array(dtype=wp.int32)  # [K], 1: a node has moved by more than half the skin since
-        # At the last such test, [E + BLOCK]: midpoints of segments, and 0.55 times their lengths.
+        # At the last such test, [E + TESTED_AT_ONCE]: midpoints of segments, and 0.55 times their lengths.
         x: wp.array(dtype=wp.float32)  # [um]
         y: wp.array(dtype=wp.float32)
         z: wp.array(dtype=wp.float32)
@@ -60,7 +60,7 @@ def allocate(model: DeviceModel) -> Any:
     elements, flagella = model.element_count, model.flagellum_count
     near.position = wp.full(elements, p.vec3(1.0e30, 0.0, 0.0), dtype=p.vec3, device=device)  # far off: stale
     near.left, near.stale = zeros(flagella, wp.int32), zeros(model.cell_count, wp.int32)
-    near.x, near.y, near.z, near.half = (zeros(elements + BLOCK, wp.float32) for _ in range(4))
+    near.x, near.y, near.z, near.half = (zeros(elements + TESTED_AT_ONCE, wp.float32) for _ in range(4))
     near.extent = zeros(flagella, p.real)
     near.count, near.earlier = zeros(elements, wp.int32), zeros(elements, wp.int32)
     near.segment = zeros(elements * SLOTS, wp.int32)
@@ -154,7 +154,7 @@ def lists(p: Precision) -> SimpleNamespace:
     half_share = wp.constant(real(0.55))
     module = p.module("neighbours_functions")
 
-    @wp.func_native(native(__file__, "near_segments", p, SLOTS=SLOTS, BLOCK=BLOCK))
+    @wp.func_native(native(__file__, "near_segments", p, SLOTS=SLOTS, TESTED_AT_ONCE=TESTED_AT_ONCE))
     def list_some(
         near: Neighbours,
         list: wp.int32,

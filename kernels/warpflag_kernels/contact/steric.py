@@ -17,7 +17,7 @@ from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW, PARALLEL
 
 # Centre lines closer than this have no direction of their own [steric diameters]: the difference of two float32
 # positions of a few um is known to some 1e-6 um, a fortieth of this (4e-5 um).
-TOUCHING = 1.0e-3
+COINCIDENT = 1.0e-3
 _SLOPE_THERE = 26.0 * LINEAR_BELOW**-14 - 7.0 * LINEAR_BELOW**-8  # -dF/dr at LINEAR_BELOW in units of F_0/sigma
 
 
@@ -31,7 +31,7 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions of contact: the force law, the closest points of two segments, a node beside the body."""
     real, vec3 = p.real, p.vec3
     Model, Pose = structs(p).Model, structs(p).Pose
-    parallel, touching = wp.constant(real(PARALLEL)), wp.constant(real(TOUCHING))
+    parallel, touching = wp.constant(real(PARALLEL)), wp.constant(real(COINCIDENT))
     module = p.module("steric_functions")
     vec2 = wp.types.vector(2, real)
 

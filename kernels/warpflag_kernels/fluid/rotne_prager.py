@@ -10,7 +10,8 @@ On a GPU the threads of a warp gather the flows at one node together, an order o
 each node, of which a cell has too few. A CPU, where one thread does a whole cell, takes every pair once for both nodes
 instead: half the square roots for the same sum.
 
-A float64 run may have its pairs in float32: `BLOCK` terms are then added up in float32, and such sums in float64.
+A float64 run may have its pairs in float32: `FLOAT32_TERMS` of them are then added up in float32,
+and such sums in float64.
 """
 
 import functools
@@ -26,7 +27,7 @@ from warpflag_kernels.base.types import DeviceModel, structs
 
 # Pairs added up in float32 before float64 takes over: with fewer, float64 additions begin to show in the time; with
 # more, float32 ones in the error (examples/benchmarks/pair_precision.py).
-BLOCK = 64
+FLOAT32_TERMS = 64
 
 
 @functools.cache
@@ -159,7 +160,7 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
             i += 1
             if wp.static(short):
                 done = i - begin
-                if done % wp.static(BLOCK) == 0 or i == end:
+                if done % wp.static(FLOAT32_TERMS) == 0 or i == end:
                     flush(s, begin, i)
 
     @wp.func(module=module)
@@ -168,9 +169,9 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
         total = vec3()
         j = begin
         while j < end:
-            part = gather_pairs(s, i, j, wp.min(j + wp.static(BLOCK * threads), end), a)
+            part = gather_pairs(s, i, j, wp.min(j + wp.static(FLOAT32_TERMS * threads), end), a)
             total += vec3(p.real(part[0]), p.real(part[1]), p.real(part[2]))
-            j += wp.static(BLOCK * threads)
+            j += wp.static(FLOAT32_TERMS * threads)
         return total
 
     gather = gather_blocks if short else gather_pairs

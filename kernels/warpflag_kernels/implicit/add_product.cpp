@@ -6,7 +6,7 @@ REAL* __restrict__ N = law_in.answered.data; const REAL* __restrict__ C = law_in
 #endif
 for (int i = begin + thread; i < stop; i += THREADS) { A[i] += L[i]; N[i] += C[i]; }
 REAL* __restrict__ X = reinterpret_cast<REAL*>(x.node.data);
-const REAL* __restrict__ Y = reinterpret_cast<const REAL*>(law_in.answer.node.data);
+const REAL* __restrict__ Y = reinterpret_cast<const REAL*>(law_in.response.node.data);
 #ifndef __CUDACC__
 #pragma clang loop vectorize(assume_safety)
 #endif

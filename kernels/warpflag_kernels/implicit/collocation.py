@@ -158,7 +158,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         law.failed[c] = 0
         finest_gap = wp.float64(model.steric.diameter[c]) * finest
         enough = wp.max(gap_share * allowed(steps, c, dt), gap_growth * dt * dt * dt)
-        law.tolerance[c] = real(wp.max(finest_gap, enough))
+        law.gap_tolerance[c] = real(wp.max(finest_gap, enough))
         contacts_out.overflow[c] = 0
         imp.evaluations[c] += 1
 

@@ -15,7 +15,7 @@ from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.rod import chain_chart
 
-SETTLING = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
+NEWTON_STEPS = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
 
 
 @functools.cache
@@ -38,9 +38,11 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
     @wp.func_native(native(__file__, "residuals", p, THREADS=threads, BITS=bits))
     def leave(law_in: Law, begin: wp.int32, stop: wp.int32, thread: wp.int32) -> real: ...
 
-    settle_words = {"SETTLING": SETTLING, "CUTOFF": CUTOFF, "LINEAR": LINEAR_BELOW}
+    words = {"NEWTON_STEPS": NEWTON_STEPS, "CUTOFF": CUTOFF, "LINEAR": LINEAR_BELOW}
 
-    @wp.func_native(native(__file__, "settle_contacts", p, LAW=law, THREADS=threads, **settle_words))
-    def settle_all(law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32): ...
+    @wp.func_native(native(__file__, "solve_single_contacts", p, LAW=law, THREADS=threads, **words))
+    def solve_single(
+        law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32
+    ): ...
 
-    return SimpleNamespace(load_all=load_all, take=take, leave=leave, settle_all=settle_all)
+    return SimpleNamespace(load_all=load_all, take=take, leave=leave, solve_single=solve_single)

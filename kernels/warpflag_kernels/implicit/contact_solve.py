@@ -47,7 +47,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
     product = delassus.functions(p, pairs, form, chains, threads).product
     block_sum, block_max = delassus.reductions(p, threads).block_sum, delassus.reductions(p, threads).block_max
     loops = contact_loops.functions(p, threads)
-    load_all, take, leave, settle_all = loops.load_all, loops.take, loops.leave, loops.settle_all
+    load_all, take, leave, solve_single = loops.load_all, loops.take, loops.leave, loops.solve_single
     secants = quasi_newton.functions(p, threads)
     learn, combine = secants.learn, secants.combine
     iterations, deep = wp.constant(ITERATIONS), wp.constant(real(DEEP))
@@ -61,7 +61,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         model: Model,
         # State:
         state: State,
-        share: wp.array(dtype=wp.float64),
+        remaining: wp.array(dtype=wp.float64),
         predicted: Increment,
         contacts_in: Contacts,
         # Out:
@@ -73,8 +73,8 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         i = contacts_in.first[c] + thread
         while i < contacts_in.first[c] + contacts_in.count[c]:
             gap = contacts_in.gap[i]
-            if share[c] > wp.float64(0.0):
-                gap += real(share[c]) * gap_change(model, state, contacts_in, i, predicted)
+            if remaining[c] > wp.float64(0.0):
+                gap += real(remaining[c]) * gap_change(model, state, contacts_in, i, predicted)
             counted = wp.max(gap, deepest * model.steric.diameter[c])
             law.force[i] = steric_force(counted, model.steric.strength[c], model.steric.diameter[c])
             law.solved_gap[i] = gap
@@ -119,7 +119,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
             end = model.first_node[model.first_flagellum[c + 1]]
             take(law, x, begin, stop, first, end, thread)
             if thread == 0:
-                x.body[c] = x.body[c] + law.answer.body[c]
+                x.body[c] = x.body[c] + law.response.body[c]
         worst = leave(law, begin, stop, thread)
         return block_max(law, worst, c, thread), loaded
 
@@ -147,7 +147,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
         begin = contacts.first[c]
         stop = begin + contacts.count[c]
         capacity = contacts.first[c + 1] - begin
-        tolerance = coarse * law.tolerance[c]
+        tolerance = coarse * law.gap_tolerance[c]
         i = begin + thread
         while i < stop:
             law.diagonal[i] = own_compliance(model, contacts, i, per_drag * real(law.gain[c] * band.step[c]))
@@ -181,7 +181,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
                     if law.solved_gap[i] < deep * diameter:
                         law.wanted[i] = law.free_gap[i] - law.solved_gap[i]
                     i += threads
-                settle_all(law, begin, stop, strength, diameter, thread)
+                solve_single(law, begin, stop, strength, diameter, thread)
         going = wp.where(stop > begin, 1, 0)
         while going != 0:
             worst, loaded = evaluate(model, state, contacts, band, flow, law, c, thread, x)
@@ -192,7 +192,7 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
                 if loaded > real(0.0):
                     learn(law, c, begin, stop - begin, capacity, thread)
                 combine(law, c, begin, stop - begin, capacity, thread)
-                settle_all(law, begin, stop, strength, diameter, thread)
+                solve_single(law, begin, stop, strength, diameter, thread)
         if thread == 0 and not (worst <= tolerance):
             law.failed[c] = 1
         meet()
@@ -205,17 +205,19 @@ def _kernels(p: Precision, pairs: str, form: str, chains: str, threads: int) -> 
     return SimpleNamespace(warm_start=warm_start, solve=solve)
 
 
-def warm_start(model: DeviceModel, state: DeviceState, share: Any, predicted: Any, contacts_out: Any, law: Any) -> None:
+def warm_start(
+    model: DeviceModel, state: DeviceState, remaining: Any, predicted: Any, contacts_out: Any, law: Any
+) -> None:
     """Warm start of the contact solve: forces at the predicted gaps of the listed contacts, into `force`.
 
     Args:
         model, state: of the batch.
-        share: fraction of the predicted increment that is still to come, shape [cell_count].
+        remaining: fraction of the predicted increment that is still to come, shape [cell_count].
         predicted: struct `Increment`.
         contacts_out: the listed contacts, struct `Contacts`.
         law: struct `ContactLaw`.
     """
-    inputs = [model.data, state.data, share, predicted, contacts_out, law]
+    inputs = [model.data, state.data, remaining, predicted, contacts_out, law]
     dim = (model.cell_count, model.plan.contact_block)
     wp.launch(_kernels_of(model).warm_start, dim, inputs=inputs, device=model.device)
 

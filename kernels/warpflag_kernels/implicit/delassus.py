@@ -49,22 +49,24 @@ def struct(p: Precision) -> Any:
         answered: wp.array(dtype=real)  # W applied [um]
         change: wp.array(dtype=real)  # W load [um]
         diagonal: wp.array(dtype=real)  # diagonal compliance, an estimate of W's diagonal [um/pN]
-        share: wp.array(dtype=real)  # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact
+        stiffness_ratio: wp.array(
+            dtype=real
+        )  # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact
         wanted: wp.array(dtype=real)  # change of gap - d F(gap) that the linear model asks for [um]
         # Secant pairs, see `quasi_newton`: orthonormal vectors, and W less the diagonal applied to them.
         loads: wp.array(dtype=real)  # [KEPT * capacity]
-        answers: wp.array(dtype=real)  # [KEPT * capacity]
+        responses: wp.array(dtype=real)  # [KEPT * capacity]
         # Per element [E], flagellum [K], thread [C * threads of a block].
         on_first: wp.array(dtype=vec3)  # of segment i [pN]
         on_second: wp.array(dtype=vec3)
         on_node: wp.array(dtype=vec3)
         on_body: wp.array(dtype=vec6)  # [K]
-        answer: Increment  # Y load
+        response: Increment  # Y load
         partial: wp.array(dtype=real)  # every thread's part of a sum or maximum
         # Per cell [C].
         gain: wp.array(dtype=wp.float64)  # g
-        tolerance: wp.array(dtype=real)  # of a gap [um]
-        small: wp.array(dtype=real)  # [C * SMALL], the linear system in the span of the secant pairs
+        gap_tolerance: wp.array(dtype=real)  # of a gap [um]
+        small: wp.array(dtype=real)  # [C * SYSTEM_ENTRIES], the linear system in the span of the secant pairs
         known: wp.array(dtype=wp.int32)  # secant pairs found so far
         products: wp.array(dtype=wp.int32)  # with W, so far
         failed: wp.array(dtype=wp.int32)  # 1: the gaps were not found
@@ -82,15 +84,15 @@ def allocate(model: DeviceModel, contacts_in: Any) -> Any:
 
     law = struct(p)()
     gaps, forces = ("free_gap", "solved_gap", "residual", "answered", "change"), ("force", "load", "applied")
-    for name in (*gaps, *forces, "diagonal", "share"):
+    for name in (*gaps, *forces, "diagonal", "stiffness_ratio"):
         setattr(law, name, zeros(total, p.real))
     law.on_node = zeros(elements, p.vec3)
     if model.plan.contact_block > 1:
         law.on_first, law.on_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
     law.on_body = zeros(model.flagellum_count, vec6)
-    law.answer.node, law.answer.body = zeros(elements, p.vec4), zeros(cells, vec6)
+    law.response.node, law.response.body = zeros(elements, p.vec4), zeros(cells, vec6)
     law.partial = zeros(cells * model.plan.contact_block, p.real)
-    law.gain, law.tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
+    law.gain, law.gap_tolerance = zeros(cells, wp.float64), zeros(cells, p.real)
     law.products, law.failed = zeros(cells, wp.int32), zeros(cells, wp.int32)
     return law
 
@@ -160,7 +162,7 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
         c: wp.int32,
         thread: wp.int32,
     ):
-        """W load into `change`, Y load into `answer`."""
+        """W load into `change`, Y load into `response`."""
         meet()
         k_begin = model.first_flagellum[c]
         k_end = model.first_flagellum[c + 1]
@@ -205,20 +207,20 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
                 if wp.static(pairs != "none"):
                     f += drag(band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
                 f = gain * f
-            law.answer.node[e] = vec4(f[0], f[1], f[2], real(0.0))
+            law.response.node[e] = vec4(f[0], f[1], f[2], real(0.0))
             e += threads
         meet()
         weight = real(band.weight[c])
         if wp.static(chains == "simd"):
-            solve_cell(model, band, c, law.answer)
+            solve_cell(model, band, c, law.response)
         k = k_begin + thread
         while k < k_end:
             first = model.first_node[k]
             if wp.static(chains == "serial"):
-                solve_flagellum(model, band, k, law.answer)
+                solve_flagellum(model, band, k, law.response)
             back = vec6(real(0.0))
             for j in range(3):
-                back += wp.transpose(band.from_body[3 * k + j]) * law.answer.node[first + j]
+                back += wp.transpose(band.from_body[3 * k + j]) * law.response.node[first + j]
             on_body = body_load(model, state, contacts_in, law.load, k, law.on_node[first])
             law.on_body[k] = gain * on_body - weight * back
             k += threads
@@ -230,19 +232,19 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
                 total += law.on_body[k]
                 k += 1
             rate = body_rate(model, state, c, total)
-            law.answer.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
+            law.response.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
             law.products[c] += 1
         meet()
-        body = law.answer.body[c]
+        body = law.response.body[c]
         e = begin + thread
         while e < end:
-            law.answer.node[e] = follow(band, e, law.answer.node[e], body)
+            law.response.node[e] = follow(band, e, law.response.node[e], body)
             e += threads
         meet()
         i = contacts_in.first[c] + thread
         stop = contacts_in.first[c] + contacts_in.count[c]
         while i < stop:
-            law.change[i] = gap_change(model, state, contacts_in, i, law.answer)
+            law.change[i] = gap_change(model, state, contacts_in, i, law.response)
             i += threads
 
     return SimpleNamespace(product=product)

@@ -1,7 +1,7 @@
-// The linear system, row by row: 1 + loads . share answers, and loads . share residual. A thread of a GPU does single
+// The linear system, row by row: 1 + loads . stiffness_ratio responses, and loads . stiffness_ratio residual. A thread of a GPU does single
 // entries, a CPU four columns at once.
-const REAL* L = law.loads.data + own; const REAL* A = law.answers.data + own;
-const REAL* __restrict__ W = law.share.data + begin; const REAL* R = law.residual.data + begin;
+const REAL* L = law.loads.data + own; const REAL* A = law.responses.data + own;
+const REAL* __restrict__ W = law.stiffness_ratio.data + begin; const REAL* R = law.residual.data + begin;
 #ifdef __CUDACC__
 for (int entry = thread; entry < n * (n + 1); entry += THREADS) {
     const int row = entry / (n + 1), column = entry % (n + 1);

@@ -194,9 +194,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
         column = (c * dimension + j) * (dimension + 2)
         i = int(0)
         while i <= j:
-            share = inner(model, krylov, c, i, w)
-            krylov.hessenberg[column + i] = share
-            add(model, krylov, c, i, -share, w)
+            projection = inner(model, krylov, c, i, w)
+            krylov.hessenberg[column + i] = projection
+            add(model, krylov, c, i, -projection, w)
             i += 1
         krylov.hessenberg[column + j + 1] = normalised(model, krylov, c, j + 1, w)
 

@@ -169,7 +169,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
-        answer: Increment,
+        response: Increment,
         # Out:
         stability: Stability,
     ):
@@ -181,7 +181,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         total = wp.float64(0.0)
         e = first
         while e < model.first_node[k + 1]:
-            d = answer.node[e]
+            d = response.node[e]
             if e == first:
                 d[0] = real(0.0)  # r_0 has no displacement of its own
                 d[1] = real(0.0)
@@ -197,7 +197,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
-        answer: Increment,
+        response: Increment,
         step: wp.array(dtype=wp.float64),
         longest_step: wp.array(dtype=wp.float64),
         # Out:
@@ -233,7 +233,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
                     over_implicit[c] = least
             stability.kappa[c] = kappa
             scale = real(wp.float64(1.0) / ratio)
-            stability.probe.body[c] = scale * answer.body[c]
+            stability.probe.body[c] = scale * response.body[c]
             e = model.first_node[model.first_flagellum[c]]
             while e < model.first_node[model.first_flagellum[c + 1]]:
                 stability.probe.node[e] = scale * stability.probe.node[e]
@@ -267,7 +267,7 @@ def measure(
     stiffness: Any,
     band: Any,
     gain: wp.array,
-    answer: Any,
+    response: Any,
     stability: Any,
     over_implicit: Any,
     longest_step: Any,
@@ -276,15 +276,15 @@ def measure(
 
     Args:
         gain: g, shape [cell_count].
-        answer: increment to work in; the forces of `state` are overwritten.
+        response: increment to work in; the forces of `state` are overwritten.
         over_implicit: shape [cell_count].
         longest_step: as in `schedule`.
     """
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
-    linearised.apply(model, state, stiffness, band, gain, stability.probe, answer)
-    linear_system.solve(model, state, band, answer)
-    inputs = [model.data, answer, stability]
+    linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
+    linear_system.solve(model, state, band, response)
+    inputs = [model.data, response, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
-    inputs = [model.data, answer, band.step, longest_step, stability, over_implicit, state.data]
+    inputs = [model.data, response, band.step, longest_step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)

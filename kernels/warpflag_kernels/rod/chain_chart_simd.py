@@ -13,7 +13,7 @@ from warpflag_kernels.base.types import structs
 
 # Square of half the angle of a turn up to which eight terms of the series hold to round-off [rad^2]: the next one is
 # 0.35^16/17! = 1e-22.
-SMALL = 0.35**2
+SMALL_ANGLE_SQUARED = 0.35**2
 
 
 def _series(first: int) -> str:
@@ -28,7 +28,12 @@ def _series(first: int) -> str:
 def rows(p: Precision, transporting: bool, Increment: Any) -> Any:
     """Device function: all rows but the first of one group of a cell, with the increment s x; transports a and b."""
     Model, Pose = structs(p).Model, structs(p).Pose
-    words = {"COSINE": _series(0), "SINE": _series(1), "SMALL": SMALL, "MANY": 2 if transporting else 0}
+    words = {
+        "COSINE": _series(0),
+        "SINE": _series(1),
+        "SMALL_ANGLE_SQUARED": SMALL_ANGLE_SQUARED,
+        "MANY": 2 if transporting else 0,
+    }
 
     @wp.func_native(simd.code(p, native(__file__, "chain_rows", p, **words)))
     def chain_rows(

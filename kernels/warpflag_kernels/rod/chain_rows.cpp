@@ -56,8 +56,8 @@ for (int i = 1; i < rows; ++i) {
     // The quaternion of the turn.
     const V y2 = REAL(0.25) * dot(w, w);
     V sine = REAL(0.5) * SINE, cosine = COSINE;
-    if (__builtin_reduce_max(y2) > REAL(SMALL))
-        for (int l = 0; l < W; ++l) if (y2[l] > REAL(SMALL)) {
+    if (__builtin_reduce_max(y2) > REAL(SMALL_ANGLE_SQUARED))
+        for (int l = 0; l < W; ++l) if (y2[l] > REAL(SMALL_ANGLE_SQUARED)) {
             const REAL half = wp::sqrt(y2[l]);
             sine[l] = REAL(0.5) * wp::sin(half) / half;
             cosine[l] = wp::cos(half);

@@ -29,7 +29,7 @@ LARGEST_TWIST = (
 )  # per joint [rad]: beyond a quarter of a turn the discrete twist no longer resolves the rod
 SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours at more than 166 degrees; the curvature 2 tan(angle/2) diverges at 180
 LARGEST_TURN = 2.0  # of a motor in one step [rad]: angles of a step are added up, and are ambiguous from pi on
-TOUCH = 0.05  # distance at which crossing centre lines count as touching [sigma]
+CROSSED = 0.05  # distance at which crossing centre lines count as touching [sigma]
 ELEMENT_BITS = 26  # of a fault code: room for 67 million elements
 
 
@@ -99,7 +99,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
     largest_strain, smallest_fold = real(LARGEST_STRAIN), real(SMALLEST_FOLD)
-    touching = wp.constant(real(TOUCH))
+    touching = wp.constant(real(CROSSED))
     least_cosine = wp.constant(real(math.cos(LARGEST_TWIST)))
     advanced = clock.functions().advanced
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)

@@ -35,7 +35,7 @@ STAGE_FACTOR = 1.54  # stages: 1 + (1 + 1.54 dt spectral radius)^1/2, as in the 
 PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
 EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last place of 1
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
-SAFETY = 1.15
+RADIUS_MARGIN = 1.15
 FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
 # Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.01 to 0.8 of
 # what the accuracy allows (docs/numerics.md).
@@ -100,7 +100,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
     chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
-    damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, SAFETY, PROBE_SIZE[p.name]))
+    damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, RADIUS_MARGIN, PROBE_SIZE[p.name]))
     weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
     rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
     stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
