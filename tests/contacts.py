@@ -188,7 +188,7 @@ class Listed:
 def listed(b: Bench, step: float = STEP, tolerance: float = FINE) -> Listed:
     s, band = b.stepper, b.factorise(step, 1.3 * GAIN)
     s.law.gain.fill_(GAIN)
-    s.law.tolerance.fill_(tolerance)
+    s.law.gap_tolerance.fill_(tolerance)
     s.law.failed.zero_()
     find(b)
     contact_solve.warm_start(b.model, b.state, s.data.one, b.increment(), s.contacts, s.law)

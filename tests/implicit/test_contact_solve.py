@@ -182,7 +182,7 @@ def test_what_cannot_be_solved_is_reported(name, device, precision):
     elif name == "a free increment":
         start.body.assign(np.full((1, 6), np.nan))
     else:
-        l.bench.stepper.law.tolerance.fill_(-1.0)
+        l.bench.stepper.law.gap_tolerance.fill_(-1.0)
     l.solve(start)
     assert l.failed()
     assert l.bench.stepper.law.products.numpy()[0] <= 1 + contact_solve.ITERATIONS
