@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from warpflag.base import rotations
 from warpflag.observables.arrays import Array, elapsed, flagella, unit
 from warpflag.observables.phase import segment_tangents
-from warpflag.observables.shape import local_axes
+from warpflag.observables.shape import OUTER_PART, local_axes
 from warpflag.scene.resistance import SpheroidMobility, spheroid_mobility
 
 if TYPE_CHECKING:
@@ -27,9 +27,6 @@ __all__ = [
     "net_speed",
     "thrust",
 ]
-
-OUTER_PART = 1 / 3
-"""Where along a flagellum the part begins that turns about its own axis, free of the hook, as a fraction of it."""
 
 
 def body_speed(times: ArrayLike, body_positions: ArrayLike, body_orientations: ArrayLike) -> float:

@@ -155,7 +155,7 @@ def swimming(record: Record, start: float | None = None, stop: float | None = No
         RecordError: the record can't be read.
     """
     scene, first_node, times = loads(record.scene_text), record.first_node, record.times
-    window = _window(record, start, stop)
+    window = record.window(start, stop)
     times, positions = times[window], record.positions[window]
     duration = elapsed(times)
     body_positions, orientations = record.body_position[window], record.body_orientation[window]
@@ -180,14 +180,6 @@ def swimming(record: Record, start: float | None = None, stop: float | None = No
         stored_power=float(energy[-1] - energy[0]) / duration,
         body_power=motion.body_power(times, body_positions, orientations, scene),
     )
-
-
-def _window(record: Record, start: float | None, stop: float | None) -> slice:
-    times = record.times
-    start = times[0] + 2 / 3 * (times[-1] - times[0]) if start is None else start
-    stop = times[-1] if stop is None else stop
-    slack = 1e-9 * times[-1]  # k duration/frames and a time typed by hand differ in the last bit
-    return slice(int(np.searchsorted(times, start - slack)), int(np.searchsorted(times, stop + slack)))
 
 
 def _rows(record: Record, flagellum: int) -> slice:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from warpflag.scene import Scene
 
 __all__ = [
+    "OUTER_PART",
     "elastic_energy",
     "helix_axis",
     "helix_pitch",
@@ -23,6 +24,9 @@ __all__ = [
     "turns_about_axis",
     "winding_number",
 ]
+
+OUTER_PART = 1 / 3
+"""Where along a flagellum the part begins that turns about its own axis, free of the hook, as a fraction of it."""
 
 
 def strain(tangents: Array, directors: Array, segment_length: float) -> Array:

@@ -31,6 +31,8 @@ from warpflag.record.opening import OpenRecord, open_record
 
 __all__ = ["Record"]
 
+_BEHAVIOUR = "warpflag.observables.behaviour.of_record"  # options of its functions are those of the methods
+
 
 class Record:
     """Reads run.h5, also while a run writes it or after one was killed: the frames committed by then.
@@ -64,6 +66,10 @@ class Record:
     to_xarray = method_from(
         "warpflag.view.tables", "dataset", "The record as an xarray.Dataset in memory; needs the extra `notebook`."
     )
+    runs_and_tumbles = method_from(_BEHAVIOUR, "runs_and_tumbles", "Runs and tumbles of the body's path.")
+    bundle_membership = method_from(_BEHAVIOUR, "bundle_membership", "The bundle of every flagellum in every frame.")
+    wobble = method_from(_BEHAVIOUR, "wobble", "Precession and nutation of the body's axis, or the bundle's.")
+    motor_loads = method_from(_BEHAVIOUR, "motor_loads", "Rate, torque and drag at which each motor works.")
     _repr_html_ = method_from("warpflag.view.page", "notebook_frame", "The page of the record, as a notebook shows it.")
 
     def __enter__(self) -> Record:
@@ -190,6 +196,19 @@ class Record:
     def versions(self) -> dict[str, str]:
         """Versions that were given for the run, by name."""
         return dict(self.parameters["versions"])
+
+    def window(self, start: float | None = None, stop: float | None = None) -> slice:
+        """The frames between two times.
+
+        Args:
+            start: [s]; default: after two thirds of the recorded time.
+            stop: [s]; default: the last frame.
+        """
+        times = self.times
+        start = times[0] + 2 / 3 * (times[-1] - times[0]) if start is None else start
+        stop = times[-1] if stop is None else stop
+        slack = 1e-9 * times[-1]  # k duration/frames and a time typed by hand differ in the last bit
+        return slice(int(np.searchsorted(times, start - slack)), int(np.searchsorted(times, stop + slack)))
 
     def frame(self, index: int) -> Frame:
         """One frame; a negative index counts from the end.

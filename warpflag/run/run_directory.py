@@ -95,12 +95,12 @@ def sync(path: Path) -> None:
 
 
 def dynamics_sha256(scene: Scene) -> str:
-    """Hash of everything in a scene but duration and frames: equal hashes mean the same motion."""
+    """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion."""
     return hashlib.sha256(_dynamics(scene).encode()).hexdigest()
 
 
 def _dynamics(scene: Scene) -> str:
-    return re.sub(r"^(duration|frames) = .*\n", "", dumps(scene), flags=re.MULTILINE)
+    return re.sub(r"^(duration|frames|behaviour) = .*\n", "", dumps(scene), flags=re.MULTILINE)
 
 
 def recorded_scene(directory: Path, prolonged: bool) -> Scene:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from warpflag import observables
+from warpflag.observables.behaviour import of_record as behaviour
 from warpflag.record import Record
 from warpflag.scene import Scene
 
@@ -29,10 +30,11 @@ def digest(record: Record, scene: Scene) -> dict[str, Any]:
         `time` [s] and number of `frames`; `observables` by name; `rates`: `motor_rate` relative to the body and
         `motor_rate_lab` [Hz], shape [flagellum_count], `body_rate` about the rearward axis [Hz] and `net_speed`,
         displacement over time [um/s], None where the window is a single frame; `events`: time of the first frame that
-        is `synchronised` and that is `zipped` [s], None where there is none.
+        is `synchronised` and that is `zipped` [s], None where there is none; where the scene asks for it, `behaviour`
+        (see `warpflag.observables.behaviour.of_record.digest`).
     """
     times, measured = record.times, record.observables
-    return {
+    found = {
         "time": float(times[-1]),
         "frames": len(times),
         "observables": {name: values[-1] for name, values in measured.items()},
@@ -42,6 +44,7 @@ def digest(record: Record, scene: Scene) -> dict[str, Any]:
             "zipped": _first(times, measured["bundle_length"] >= observables.ZIPPED),
         },
     }
+    return found | {"behaviour": behaviour.digest(record)} if scene.behaviour else found
 
 
 def plain(value: Any) -> Any:

@@ -26,7 +26,7 @@ from warpflag.scene.sections import (
     Start,
     Steric,
 )
-from warpflag.scene.settings import Section, integer, number, text
+from warpflag.scene.settings import Section, integer, number, switch, text
 
 __all__ = ["FlagellumSpec", "Scene"]
 
@@ -78,6 +78,7 @@ class Scene(Section, key=""):
     )
     duration: float = number(0.015, "s", 1e-12, 10, "simulated time")
     frames: int = integer(300, 1, 10_000_000, "recorded intervals; frames + 1 values are kept")
+    behaviour: bool = switch(False, "runs and tumbles, bundles, wobble and motor loads in the summary")
     flagella: Flagella = dataclasses.field(default_factory=Flagella)
     flagellum: tuple[FlagellumOverride, ...] = ()
     motor: Motor = dataclasses.field(default_factory=Motor)

@@ -18,7 +18,7 @@ __all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "summary_of", "write"]
 
 TABLE_NAME, MEANS_NAME, HDF5_NAME = "table.csv", "means.csv", "table.h5"
 # Of a summary; what the machine took for it is no result.
-_NUMBERS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events")
+_NUMBERS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events", "behaviour")
 
 
 def summary_of(directory: Path) -> dict[str, Any]:
