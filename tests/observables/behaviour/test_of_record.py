@@ -21,7 +21,7 @@ def made(tmp_path_factory):
 
 
 def test_a_made_up_record(made):
-    """Two flagella that zip, from 40 % of their length on at 1 ms, on a body that swims straight along its axis at 150 um/s."""
+    """Two flagella that zip, from 40 % of their length on at 1 ms, on a body that swims along its axis at 150 um/s."""
     with Record(made.directory) as record:
         membership = record.bundle_membership()
         together = made.front(record.times) >= 0.4

@@ -18,8 +18,8 @@ ALONE = -1
 """Stands for the bundle of a flagellum that is in none."""
 SHARE = 1 / 3
 """Part of a flagellum's nodes that lie beside another one if the two are of one bundle: more than a crossing gives, and
-less than a finished bundle has, whose flagella come together at some distance from a wide body (three of 7.5 um: at half
-their length)."""
+less than a finished bundle has, whose flagella come together at some distance from a wide body (three of 7.5 um: at
+half their length)."""
 
 _PAIRS_AT_ONCE = 1 << 15  # of nodes and segments: temporary arrays that fit the cache
 
@@ -29,8 +29,8 @@ def bundle_membership(
 ) -> NDArray[np.int64]:
     """The bundle of every flagellum, shape [frame_count, flagellum_count]; -1 for one that is alone.
 
-    Two flagella are joined if a third of the nodes of one lie within the distance of the other's centre line; a bundle is
-    what is joined directly or through others. It has the number of its first flagellum.
+    Two flagella are joined if a third of the nodes of one lie within the distance of the other's centre line; a bundle
+    is what is joined directly or through others. It has the number of its first flagellum.
 
     Args:
         positions: nodes [um], shape [frame_count, node_count, 3].
