@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.implicit import linear_system, linearised
-from warpflag_kernels.rod import chain_chart, hessian
+from warpflag_kernels.rod import chain_chart
 
 from tests.helpers import anchors, cell, matrix, shaken
 from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius
@@ -71,7 +71,7 @@ class Bench:
         band.step.fill_(step)
         band.weight.fill_(weight)
         band.singular.zero_()
-        hessian.joint_stiffness(self.model, self.state, stiffness)
+        linear_system.set_stiffness(self.model, self.state, stiffness)
         linear_system.factorise(self.model, self.state, stiffness, band)
         return band
 

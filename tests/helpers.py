@@ -93,10 +93,15 @@ def carried(v: np.ndarray, t: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def attachment(scene: Scene, spec: FlagellumSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Anchor and motor axis in body axes: r_0 = d e_b3 + (width/2) n, m = cos e_b3 + sin n."""
+    """Anchor and motor axis in body axes: r_0 = d e_b3 + (width/2) n + (hook length) m, m = cos e_b3 + sin n; on a cap
+    with the radius of the sphere there in place of width/2."""
     azimuth, angle = math.radians(spec.azimuth), math.radians(spec.motor_axis_angle)
     normal, rear = np.array([math.cos(azimuth), math.sin(azimuth), 0.0]), np.array([0.0, 0.0, 1.0])
-    return spec.anchor_offset * rear + scene.body.width / 2 * normal, math.cos(angle) * rear + math.sin(angle) * normal
+    m = math.cos(angle) * rear + math.sin(angle) * normal
+    radius = scene.body.width / 2
+    on_cap = max(abs(spec.anchor_offset) - (scene.body.length - scene.body.width) / 2, 0.0)
+    surface = spec.anchor_offset * rear + math.sqrt(radius**2 - on_cap**2) * normal
+    return surface + scene.hook.length * m, m
 
 
 def tangents(scene: Scene, start: InitialState) -> list[np.ndarray]:

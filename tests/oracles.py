@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from tests.helpers import carried, displaced, free_nodes, matrix, tangents, unit
+from tests.helpers import carried, displaced, free_nodes, ground_state_frames, helix_axis, matrix, tangents, unit
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene
+from warpflag.scene import FlagellumSpec, Scene
 
 CUTOFF = 2.0 ** (1.0 / 6.0)  # of the steric force, in diameters
 
@@ -34,7 +34,7 @@ def strains(t: np.ndarray, e1: np.ndarray) -> np.ndarray:
 
 
 def elastic_energies(scene: Scene, start: InitialState) -> np.ndarray:
-    """Bending, twist and stretching energy [pN um], shape [3]."""
+    """Bending, twist and stretching energy, of filaments and hooks [pN um], shape [3]."""
     group, total = scene.flagella, np.zeros(3)
     stiffness = np.array([group.bending_rigidity, group.bending_rigidity, group.twist_rigidity])
     frames = zip(tangents(scene, start), start.directors, strict=True)
@@ -45,11 +45,25 @@ def elastic_energies(scene: Scene, start: InitialState) -> np.ndarray:
         hook = group.hook_twist_factor * group.twist_rigidity / (2 * h) * joint[0, 2] ** 2
         stretch = np.linalg.norm(np.diff(x, axis=0), axis=1) / h - 1
         total += [
-            density[:, :2].sum(),
+            density[:, :2].sum() + hook_bending(scene, spec, t, e1),
             density[:, 2].sum() + hook,
             group.stretching_stiffness * h / 2 * stretch @ stretch,
         ]
     return total
+
+
+def hook_bending(scene: Scene, spec: FlagellumSpec, t: np.ndarray, e1: np.ndarray) -> float:
+    """(k/2) (2 tan(beta/2))^2, beta from the motor axis t[0] to the axis of the helix at rest with segment 1."""
+    stiffness = scene.hook.stiffness
+    if scene.hook.stiffening_torque is not None:
+        stiffness *= 1 + abs(spec.torque) / scene.hook.stiffening_torque
+    if stiffness == 0.0:
+        return 0.0
+    frames = ground_state_frames(8, spec.segment_length, scene.flagella.intrinsic_curvature)
+    own, _ = helix_axis(np.cumsum(spec.segment_length * frames[:, :, 2], axis=0))
+    axis = own[0] * e1[1] + own[1] * np.cross(t[1], e1[1]) + own[2] * t[1]
+    beta = math.atan2(np.linalg.norm(np.cross(t[0], axis)), t[0] @ axis)
+    return stiffness / 2 * (2 * math.tan(beta / 2)) ** 2
 
 
 def steric_potential(r: Any, strength: float, diameter: float) -> np.ndarray:

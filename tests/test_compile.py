@@ -28,6 +28,7 @@ SWITCHES = {
         "motor.bearing_torque": False,
     },
     "short": {"numerics.pair_precision": "float32"},
+    "hook": {"hook.stiffness": 0.65},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
@@ -40,6 +41,7 @@ VARIANTS = [
     ("rkc", "short"),
     ("rkc", "external"),
     ("implicit", "none"),
+    ("implicit", "hook"),
 ]
 
 

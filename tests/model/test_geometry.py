@@ -265,3 +265,35 @@ def test_flagella_of_unequal_length_can_be_shifted():
     first_node = np.array([0, 31, 52])
     theta = phase_difference(np.vstack(state.positions), np.vstack(state.directors), first_node)
     assert theta == pytest.approx(0.7, abs=1e-10)
+
+
+@pytest.mark.parametrize("h", [0.2, 0.05])
+def test_on_its_axis_a_flagellum_starts_there_and_ends_as_the_helix(h):
+    values = {
+        "flagella.on_axis": True,
+        "flagella.segment_length": h,
+        "flagella.count": 1,
+        "flagella.opening_angle": 50.0,
+    }
+    scene = with_values(paper_scene(), values)
+    nodes, e1 = initial_state(scene).positions[0], initial_state(scene).directors[0][1:]
+    edges = np.diff(nodes, axis=0)
+    assert np.linalg.norm(edges, axis=1) == pytest.approx(h, rel=1e-12)
+    axis = np.array([math.sin(math.radians(25.0)), 0.0, math.cos(math.radians(25.0))])
+    across = (nodes - nodes[0]) - np.outer((nodes - nodes[0]) @ axis, axis)
+    distance = np.linalg.norm(across, axis=1)
+    beyond = int(np.searchsorted((nodes - nodes[0]) @ axis, 0.5))
+    assert distance[beyond:] == pytest.approx(ground_state(NORMAL, h).radius, rel=1e-9)
+    assert (np.diff(distance[: beyond + 1]) > 0).all()
+    # Beyond the taper the intrinsic strain is the helix's, and the shape has no energy anywhere.
+    strains = joint_strains(tangents(nodes), e1)
+    assert strains[beyond:] == pytest.approx(np.tile(h * np.array(NORMAL), (len(strains) - beyond, 1)), abs=1e-9)
+
+
+@pytest.mark.parametrize("offset", [1.25, 1.1, -0.9])
+def test_anchors_may_lie_on_the_caps(offset):
+    scene = with_values(paper_scene(), {"flagella.count": 1, "flagella.anchor_offset": offset})
+    anchor = initial_state(scene).positions[0][0]
+    centre = np.array([0.0, 0.0, math.copysign(0.85, offset)])
+    assert anchor[2] == pytest.approx(offset)
+    assert np.linalg.norm(anchor - centre) == pytest.approx(0.4)

@@ -65,7 +65,7 @@ REFUSED = [
     ("[flagella]\nlength = 6000.0", "flagella.length", ["looks like nanometres"]),
     ("[flagella]\nfilament_radius = 1e-8", "flagella.filament_radius", ["looks like metres"]),
     ("[flagella]\nanchor_offset = 6e-7", "flagella.anchor_offset", ["looks like metres"]),
-    ("[flagella]\nanchor_offset = 0.9", "flagella.anchor_offset", ["-0.85 to 0.85 um"]),
+    ("[flagella]\nanchor_offset = 1.3", "flagella.anchor_offset", ["-1.25 to 1.25 um"]),
     ("[flagella]\nbending_rigidity = 3.5e-24", "flagella.bending_rigidity", ["newton square metres"]),
     ("[flagella]\nstretching_stiffness = 1e-9", "flagella.stretching_stiffness", ["looks like newtons"]),
     ("[flagella]\nintrinsic_curvature = [1.3, -2.1]", "flagella.intrinsic_curvature", ["three numbers"]),
@@ -91,7 +91,7 @@ REFUSED = [
     ("[[flagellum]]\n[[flagellum]]\ntorque = 'a'", "flagellum.1.torque", ["must be a number"]),
     ("[[flagellum]]\nsegments = 1", "flagellum.0.segments", ["2 to 10000"]),
     ("[[flagellum]]\nsegments = 2\nlength = 5", "flagellum.0.segments", ["below pi"]),
-    ("[[flagellum]]\n[[flagellum]]\nanchor_offset = -2", "flagellum.1.anchor_offset", ["cylinder part"]),
+    ("[[flagellum]]\n[[flagellum]]\nanchor_offset = -2", "flagellum.1.anchor_offset", ["ends of the body"]),
     ("[[flagellum]]\n[[flagellum]]\nazimuth = 360", "flagellum.1.azimuth", ["anchor of flagellum 0"]),
     (
         "[flagella]\nphase_difference = 0.5\n[[flagellum]]\nphase = 9\n[[flagellum]]",

@@ -36,10 +36,14 @@ UNEQUAL = {
 }
 
 
+HOOK = {"hook.length": 0.055, "hook.stiffness": 2.0, "hook.stiffening_torque": 3.0}
+CASES = {"two": {}, "unequal": UNEQUAL, "hook": HOOK}
+
+
 @cache
-def state_in_contact(precision: str, device: str, unequal: bool) -> tuple[Scene, InitialState, Evaluation]:
+def state_in_contact(precision: str, device: str, case: str) -> tuple[Scene, InitialState, Evaluation]:
     """Side by side, turned by their motors for 10 us: twisted, bent, and pressed together."""
-    scene = touching_cell({"numerics.time_step": 1e-6, "motor.torque": 5.0, **(UNEQUAL if unequal else {})}, precision)
+    scene = touching_cell({"numerics.time_step": 1e-6, "motor.torque": 5.0, **CASES[case]}, precision)
     sim = Simulation(scene, device=device)
     sim.advance(1e-5)
     start = as_start(scene, sim.cell_state())
@@ -52,9 +56,9 @@ def arms(start: InitialState) -> np.ndarray:
     return np.concatenate(start.positions) - start.body_position
 
 
-@pytest.mark.parametrize("unequal", [False, True])
-def test_swimmer_is_free_of_net_force_and_torque(unequal, precision, device):
-    scene, start, found = state_in_contact(precision, device, unequal)
+@pytest.mark.parametrize("case", CASES)
+def test_swimmer_is_free_of_net_force_and_torque(case, precision, device):
+    scene, start, found = state_in_contact(precision, device, case)
     nodes, t = free_nodes(scene), np.concatenate(tangents(scene, start))
     forces = np.vstack([found.forces[nodes], found.body_force])
     torques = np.vstack([
@@ -68,7 +72,7 @@ def test_swimmer_is_free_of_net_force_and_torque(unequal, precision, device):
 
 def test_paper_s_form_is_not_torque_free(device):
     """What dropping the bearing torque costs: the same sum, far from zero."""
-    scene, start, _ = state_in_contact("float64", device, False)
+    scene, start, _ = state_in_contact("float64", device, "two")
     found = Simulation(with_values(scene, {"motor.bearing_torque": False}), device=device, starts=start).evaluate()
     nodes, t = free_nodes(scene), np.concatenate(tangents(scene, start))
     net = np.cross(arms(start)[nodes], found.forces[nodes]).sum(axis=0) + found.torques @ t + found.body_torque
@@ -110,23 +114,23 @@ def body_drags(scene: Scene) -> tuple[float, float, float, float]:
     return 1 / m.along, 1 / m.across, 1 / m.spin, 1 / m.tumble
 
 
-@pytest.mark.parametrize("unequal", [False, True])
-def test_motor_power_is_dissipation_and_stored_energy(unequal, precision, device):
-    scene, start, found = state_in_contact(precision, device, unequal)
+@pytest.mark.parametrize("case", CASES)
+def test_motor_power_is_dissipation_and_stored_energy(case, precision, device):
+    scene, start, found = state_in_contact(precision, device, case)
     assert abs(imbalance(scene, start, found)) < POWER[precision]
 
 
 @pytest.mark.parametrize("part", ["velocities", "spins", "body_velocity", "body_spin"])
 def test_power_balance_notices_a_wrong_velocity(part, device):
     """A part in a hundred of any share of the motion breaks the balance."""
-    scene, start, found = state_in_contact("float64", device, False)
+    scene, start, found = state_in_contact("float64", device, "two")
     wrong = replace(found, **{part: 1.01 * getattr(found, part)})
     assert abs(imbalance(scene, start, wrong)) > 10 * POWER["float64"]
 
 
 def test_power_balance_notices_a_wrong_mobility(device):
     """The velocities of the pair radius as printed do not balance with the dense matrix of the default one."""
-    scene, start, _ = state_in_contact("float64", device, False)
+    scene, start, _ = state_in_contact("float64", device, "two")
     printed = with_values(scene, {"hydrodynamics.mode": "as_printed"})
     found = Simulation(printed, device=device, starts=start).evaluate()
     assert abs(imbalance(scene, start, found)) > 1e-4
@@ -135,7 +139,7 @@ def test_power_balance_notices_a_wrong_mobility(device):
 
 def test_a_step_moves_the_cell_by_its_velocities(precision, device):
     """One step of explicit Euler: nodes and body by their velocities, frames by the minimal rotation and their spin."""
-    scene, start, _ = state_in_contact(precision, device, False)
+    scene, start, _ = state_in_contact(precision, device, "two")
     step = 1e-9
     scene = with_values(scene, {"numerics.stepper": "euler", "numerics.time_step": step})
     sim = Simulation(scene, device=device, starts=start)

@@ -19,7 +19,8 @@ from warpflag_kernels.stepping.terms import terms_named
 from warpflag.base import rotations
 from warpflag.model.geometry import InitialState
 from warpflag.model.terms import SCENE_TERMS, switches_of
-from warpflag.scene import Scene, SceneError
+from warpflag.scene import Flagella, FlagellumSpec, Scene, SceneError, attachment
+from warpflag.scene.helix import rest_shape
 from warpflag.scene.resistance import filament_mobility, pair_radius, spheroid_mobility
 
 __all__ = ["build_chart", "build_control", "build_model", "build_state", "plan_of"]
@@ -80,10 +81,12 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
     m.rod.twist_rigidity = reals([g.twist_rigidity for g in group])
     m.rod.hook_rigidity = reals([g.hook_twist_factor * g.twist_rigidity for g in group])
     m.rod.stretching_stiffness = reals([g.stretching_stiffness for g in group])
-    m.rod.rest_strain = vectors(h[:, None] * np.array([g.intrinsic_curvature for g in group]))
+    m.rod.rest_strain = vectors(
+        np.concatenate([_rest_strain(g, spec) for g, spec in zip(group, flagella, strict=True)])
+    )
 
-    motor_axis, anchor = _attachment(scenes, flagella, owner)
-    m.motor.axis, m.motor.anchor = vectors(motor_axis), vectors(anchor)
+    m.motor.axis = vectors([attachment.motor_axis(spec) for spec in flagella])
+    m.motor.anchor = vectors([attachment.anchor(scenes[c], spec) for c, spec in zip(owner, flagella, strict=True)])
 
     mobility = [filament_mobility(scenes[c], s.segment_length) for c, s in zip(owner, flagella, strict=True)]
     weight = np.ones(len(flagellum_of))
@@ -163,16 +166,11 @@ def build_control(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     return control
 
 
-def _attachment(scenes: Sequence[Scene], flagella: Sequence[Any], owner: Sequence[int]) -> tuple[Any, Any]:
-    """Motor axis and anchor of every flagellum in body axes: m = cos e_b3 + sin n, r_0 = d e_b3 + (width/2) n."""
-    azimuth = np.radians([spec.azimuth for spec in flagella])
-    normal = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)], axis=1)
-    angle = np.radians([spec.motor_axis_angle for spec in flagella])
-    rear = np.array([0.0, 0.0, 1.0])
-    axis = np.cos(angle)[:, None] * rear + np.sin(angle)[:, None] * normal
-    offset = np.array([spec.anchor_offset for spec in flagella])
-    radius = np.array([scenes[c].body.width / 2 for c in owner])
-    return axis, offset[:, None] * rear + radius[:, None] * normal
+def _rest_strain(group: Flagella, spec: FlagellumSpec) -> np.ndarray:
+    """h Omega^0 of the joint after every segment [rad], shape [N + 1, 3]; the hook's and the last segment's unused."""
+    h, joints = spec.segment_length, np.zeros((spec.segment_count + 1, 3))
+    joints[1:-1] = h * rest_shape(group.intrinsic_curvature, h, spec.segment_count, group.on_axis).strain
+    return joints
 
 
 def _body_mobility(scene: Scene) -> tuple[float, float, float, float]:

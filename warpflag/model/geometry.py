@@ -1,9 +1,9 @@
 """A scene's initial shape: flagella in their exact discrete ground state, anchored on the body.
 
 At time 0 the body axes e_b1, e_b2, e_b3 are the lab's x, y, z and the body's centre is the origin. Flagellum
-k at azimuth alpha has the outward normal n = cos(alpha) e_b1 + sin(alpha) e_b2, its anchor
-r_0 = d e_b3 + (width/2) n, its helix axis cos(tilt) e_b3 + sin(tilt) n and its motor axis
-m = cos(angle) e_b3 + sin(angle) n. The paper shows but does not print these choices.
+k at azimuth alpha has n = cos(alpha) e_b1 + sin(alpha) e_b2, its anchor r_0 = d e_b3 + (width/2) n + (hook length) m,
+its helix axis cos(tilt) e_b3 + sin(tilt) n and its motor axis m = cos(angle) e_b3 + sin(angle) n. The paper shows but
+does not print these choices; its hook has no length.
 """
 
 from __future__ import annotations
@@ -14,15 +14,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from warpflag.base import rotations
 from warpflag.observables import local_phase_difference
-from warpflag.scene import FlagellumSpec, Scene, SceneError
+from warpflag.scene import FlagellumSpec, Scene, SceneError, attachment
+from warpflag.scene.helix import DiscreteHelix, across, ground_state, rest_shape, rotation_matrix
+
+__all__ = [
+    "DEFAULT_PHASE",
+    "DiscreteHelix",
+    "InitialState",
+    "ground_state",
+    "initial_state",
+    "phase_difference_at",
+    "rotation_matrix",
+    "with_phase",
+]
 
 Array = NDArray[np.floating]
 
 DEFAULT_PHASE = 180.0  # deg; where the anchor sits about the helix axis unless the scene says otherwise
 _PHASE_TOLERANCE = 1e-6  # of a phase difference: 1 asked for is 1 - 1e-8 found
-_STRAIGHT = 1e-9  # um; a helix of smaller radius has no direction from its axis to a node
 
 
 @dataclass(frozen=True)
@@ -39,66 +49,6 @@ class InitialState:
     body_position: Array
     body_orientation: Array
     time: float = 0.0
-
-
-@dataclass(frozen=True)
-class DiscreteHelix:
-    """The zero-energy shape of a discrete rod: every joint turns the frame by the same rotation.
-
-    Everything is in the axes (e1, e2, e3) of the first segment. joint: that rotation, columns are the next
-    segment's axes, shape [3, 3]; axis: unit axis of the helix, along which the nodes advance, shape [3];
-    angle: turn about it per joint [rad], negative for a left-handed helix; rise: advance per segment [um];
-    radius: of the nodes [um]; outward: unit vector from the axis to the first node, shape [3] (e1 for a
-    straight rod, which has none).
-    """
-
-    joint: Array
-    axis: Array
-    angle: float
-    rise: float
-    radius: float
-    outward: Array
-
-    @property
-    def pitch(self) -> float:
-        """Advance per turn [um]; infinite for a rod that does not turn."""
-        return 2 * math.pi * self.rise / abs(self.angle) if self.angle else math.inf
-
-
-def ground_state(strain: tuple[float, float, float], segment_length: float) -> DiscreteHelix:
-    """Discrete helix on which every joint has exactly the intrinsic strain.
-
-    strain: (Omega_1, Omega_2, Omega_3) [1/um]; segment_length: h [um]. Discrete elastic rods (Bergou et al.
-    2008): between segments e and f with curvature binormal kb = 2 t_e x t_f / (1 + t_e.t_f), the strains are
-    h Omega_1 = kb.(e1_e + e1_f)/2, h Omega_2 = kb.(e2_e + e2_f)/2, and h Omega_3 is the twist from e1_e,
-    parallel-transported onto f, to e1_f. Since transport keeps the components of kb, the first two are
-    cos(twist/2) times kb turned by twist/2, which is inverted here: |kb| = h |(Omega_1, Omega_2)| /
-    cos(twist/2). Raises ValueError unless |h Omega_3| < pi.
-    """
-    bend_1, bend_2, twist = (segment_length * component for component in strain)
-    if not abs(twist) < math.pi:
-        raise ValueError(f"the twist per joint is {twist:g} rad; it must be below pi in magnitude")
-    cos_half, sin_half = math.cos(twist / 2), math.sin(twist / 2)
-    # Half-angle quaternions: |kb| = 2 tan(bend/2), so kb/2 is tan(bend/2) times the bending axis.
-    half_binormal = np.array([cos_half * bend_1 - sin_half * bend_2, sin_half * bend_1 + cos_half * bend_2, 0])
-    half_binormal /= 2 * cos_half
-    turn = rotations.product(np.array([*half_binormal, 1.0]), np.array([0.0, 0.0, sin_half / cos_half, 1.0]))
-    vector, scalar = turn[:3], turn[3]
-    sine = float(np.linalg.norm(vector))
-    angle = 2 * math.atan2(sine, scalar)
-    axis = vector / sine if sine > 0 else np.array([0.0, 0.0, 1.0])
-    if axis[2] < 0:
-        axis, angle = -axis, -angle
-    rise = segment_length * float(axis[2])
-    # The nodes lie on a circle about the axis; seen along it each segment is a chord of `angle`.
-    chord = segment_length * (np.array([0.0, 0.0, 1.0]) - axis[2] * axis)
-    chord_length = float(np.linalg.norm(chord))
-    radius = chord_length / (2 * math.sin(abs(angle) / 2)) if chord_length > 0 else 0.0
-    if radius > _STRAIGHT:
-        outward = -(chord + np.cross(axis, chord) / math.tan(angle / 2)) / (2 * radius)
-    else:
-        outward = np.array([1.0, 0.0, 0.0])
-    return DiscreteHelix(rotation_matrix(axis, angle), axis, angle, rise, radius, outward)
 
 
 def initial_state(scene: Scene) -> InitialState:
@@ -168,33 +118,18 @@ def _phase_shift(scene: Scene) -> float:
 
 def _flagellum(scene: Scene, spec: FlagellumSpec) -> tuple[Array, Array]:
     """Nodes [um], shape [N + 1, 3], and e1 of segments 1..N, shape [N, 3], on a body at the origin."""
-    helix = ground_state(scene.flagella.intrinsic_curvature, spec.segment_length)
-    normal = _direction(90.0, spec.azimuth)
-    axis = _direction(spec.tilt, spec.azimuth)
-    anchor = np.array([0.0, 0.0, spec.anchor_offset]) + scene.body.width / 2 * normal
+    rest = rest_shape(
+        scene.flagella.intrinsic_curvature, spec.segment_length, spec.segment_count, scene.flagella.on_axis
+    )
+    axis = np.array(attachment.direction(spec.tilt, spec.azimuth))
     outward = _phase_direction(axis, 0.0 if spec.phase is None else spec.phase)
     # Axes of segment 1: its helix axis onto the wanted one, its outward direction onto the phase's.
-    local = np.stack([helix.axis, *_across(helix.axis, helix.outward)], axis=1)
-    first = np.stack([axis, *_across(axis, outward)], axis=1) @ local.T
-    # Powers of the joint in closed form: no error accumulates along the filament.
-    turns = rotation_matrix(helix.axis, helix.angle * np.arange(spec.segment_count))
-    frames = first @ turns
+    first = np.stack([axis, *across(axis, outward)], axis=1) @ rest.helix_axes.T
+    frames = first @ rest.frames
     steps = spec.segment_length * frames[:, :, 2]
+    anchor = np.array(attachment.anchor(scene, spec))
     nodes = np.vstack([anchor, anchor + np.cumsum(steps, axis=0)])
     return nodes, frames[:, :, 0]
-
-
-def _across(axis: Array, outward: Array) -> tuple[Array, Array]:
-    """Two unit vectors across ``axis``: ``outward`` made perpendicular to it, and axis x that."""
-    first = outward - np.dot(outward, axis) * axis
-    first /= np.linalg.norm(first)
-    return first, np.cross(axis, first)
-
-
-def _direction(angle: float, azimuth: float) -> Array:
-    """Unit vector at ``angle`` to e_b3 toward the outward normal at ``azimuth`` [deg]."""
-    polar, around = math.radians(angle), math.radians(azimuth)
-    return np.array([math.sin(polar) * math.cos(around), math.sin(polar) * math.sin(around), math.cos(polar)])
 
 
 def _phase_direction(axis: Array, phase: float) -> Array:
@@ -202,13 +137,13 @@ def _phase_direction(axis: Array, phase: float) -> Array:
     x = np.array([1.0, 0.0, 0.0])
     # Along x the projection vanishes; its limit for an axis tilted in the x-z plane is taken.
     reference = x if abs(axis[0]) < 1 - 1e-12 else np.array([0.0, 0.0, -axis[0]])
-    first, second = _across(axis, reference)
+    first, second = across(axis, reference)
     return math.cos(math.radians(phase)) * first + math.sin(math.radians(phase)) * second
 
 
 def _tripod(scene: Scene, k: int, spec: FlagellumSpec, e1: Array, edge: Array) -> Array:
     """e1 of the motor tripod: segment 1's, carried onto the motor axis by the minimal rotation."""
-    motor_axis = _direction(spec.motor_axis_angle, spec.azimuth)
+    motor_axis = np.array(attachment.motor_axis(spec))
     tangent = edge / np.linalg.norm(edge)
     cosine = float(np.dot(tangent, motor_axis))
     if cosine < -0.999:
@@ -217,11 +152,3 @@ def _tripod(scene: Scene, k: int, spec: FlagellumSpec, e1: Array, edge: Array) -
         problem = f"points against the first segment of flagellum {k}: the hook joint is undefined there"
         raise SceneError(key, spec.motor_axis_angle, problem)
     return e1 - np.dot(e1, motor_axis) / (1 + cosine) * (tangent + motor_axis)
-
-
-def rotation_matrix(axis: Array, angle: float | Array) -> Array:
-    """Rotation about a unit axis by ``angle`` [rad], shape [..., 3, 3] for angles of shape [...]."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, half = np.sin(angle)[..., None, None], np.sin(np.asarray(angle) / 2)[..., None, None]
-    return np.eye(3) + sine * cross + 2 * half**2 * (cross @ cross)

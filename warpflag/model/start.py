@@ -7,7 +7,7 @@ import numpy as np
 from warpflag.base import rotations
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.record import Frame, Record, RecordError
-from warpflag.scene import Scene, SceneError
+from warpflag.scene import Body, Scene, SceneError, attachment
 
 __all__ = ["shape_of_frame", "starting_state"]
 
@@ -55,11 +55,8 @@ def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
 
 def _check_outside(scene: Scene, start: InitialState) -> None:
     """Nodes r_1..r_N well below the body's surface would be torn out of it by the contact force in the first step."""
-    half, radius = (scene.body.length - scene.body.width) / 2, scene.body.width / 2
     for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
-        axis_points = np.zeros_like(nodes)
-        axis_points[:, 2] = np.clip(nodes[:, 2], -half, half)
-        depth = radius - np.linalg.norm(nodes - axis_points, axis=1)[1:]
+        depth = _depths(scene.body, nodes[1:])
         if depth.max() > 0.0:
             problem = (
                 f"starts flagellum {k} inside the body: node {int(depth.argmax()) + 1} is {depth.max():.3g} um deep"
@@ -68,15 +65,22 @@ def _check_outside(scene: Scene, start: InitialState) -> None:
             raise SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
 
 
+def _depths(body: Body, points: np.ndarray) -> np.ndarray:
+    """How far points in body axes lie below the body's surface [um], shape [count]; negative outside."""
+    half = (body.length - body.width) / 2
+    axis_points = np.zeros_like(points)
+    axis_points[:, 2] = np.clip(points[:, 2], -half, half)
+    return body.width / 2 - np.linalg.norm(points - axis_points, axis=1)
+
+
 def _check_anchors(scene: Scene, start: InitialState) -> None:
     """A record of flagella anchored elsewhere would tear them off the body in the first step."""
     to_lab = rotations.matrix(start.body_orientation)
     for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
-        around, radius = np.radians(spec.azimuth), scene.body.width / 2
-        anchor = np.array([radius * np.cos(around), radius * np.sin(around), spec.anchor_offset])
-        if np.linalg.norm(start.body_position + to_lab @ anchor - nodes[0]) > _ANCHOR_TOLERANCE:
+        anchor = start.body_position + to_lab @ np.array(attachment.anchor(scene, spec))
+        if np.linalg.norm(anchor - nodes[0]) > _ANCHOR_TOLERANCE:
             problem = f"anchors flagellum {k} elsewhere on the body than the scene does"
-            raise SceneError(*_record_of(scene), problem, ["flagella.anchor_offset", "body.width"])
+            raise SceneError(*_record_of(scene), problem, ["flagella.anchor_offset", "body.width", "hook.length"])
 
 
 def _record_of(scene: Scene) -> tuple[str, str | None]:

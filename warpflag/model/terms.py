@@ -15,6 +15,7 @@ from warpflag_kernels.base.plan import Switches
 
 from warpflag.record.cell_state import Evaluation
 from warpflag.scene import Scene
+from warpflag.scene.helix import rest_shape
 
 __all__ = ["SCENE_TERMS", "SceneTerm", "supplied_power", "switches_of"]
 
@@ -49,6 +50,21 @@ def _motor_power(scene: Scene, found: Evaluation) -> float:
     return float(torques @ turns)
 
 
+def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+    flagella = [(scene, spec) for scene in scenes for spec in scene.resolved_flagella()]
+    rest = [
+        rest_shape(scene.flagella.intrinsic_curvature, s.segment_length, s.segment_count, scene.flagella.on_axis)
+        for scene, s in flagella
+    ]
+    limits = [scene.hook.stiffening_torque for scene, _ in flagella]
+    stiffness = np.array([scene.hook.stiffness for scene, _ in flagella])
+    stiffening = np.array([0.0 if limit is None else 1.0 / limit for limit in limits])
+    data.hook.stiffness = wp.array(stiffness, dtype=precision.real, device=device)
+    data.hook.stiffening = wp.array(stiffening, dtype=precision.real, device=device)
+    axes = np.array([shape.helix_axes[:, 0] for shape in rest])
+    data.hook.helix_axis = wp.array(axes, dtype=precision.vec3, device=device)
+
+
 def _external_forces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return np.array(scene.external.force_per_length), np.array(scene.external.body_force)
 
@@ -78,6 +94,7 @@ SCENE_TERMS = (
     SceneTerm("motor", lambda scene: True, fill=_fill_motor, power=_motor_power),
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque),
+    SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0, fill=_fill_hook),
     SceneTerm("steric", lambda scene: scene.steric.enabled and _several(scene)),
     SceneTerm("body contact", lambda scene: scene.body.contact),
     SceneTerm(

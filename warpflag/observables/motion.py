@@ -11,6 +11,7 @@ from warpflag.base import rotations
 from warpflag.observables.arrays import Array, elapsed, flagella, unit
 from warpflag.observables.phase import segment_tangents
 from warpflag.observables.shape import OUTER_PART, local_axes
+from warpflag.scene import attachment
 from warpflag.scene.resistance import SpheroidMobility, spheroid_mobility
 
 if TYPE_CHECKING:
@@ -115,10 +116,7 @@ def lab_motor_rate(
 
 def motor_axes(scene: Scene) -> Array:
     """Motor axes m = cos(angle) e_b3 + sin(angle) n in body axes, n the outward normal, shape [flagellum_count, 3]."""
-    specs = scene.resolved_flagella()
-    angle = np.radians([spec.motor_axis_angle for spec in specs])
-    around = np.radians([spec.azimuth for spec in specs])
-    return np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], axis=1)
+    return np.array([attachment.motor_axis(spec) for spec in scene.resolved_flagella()])
 
 
 def helix_rate(times: ArrayLike, positions: ArrayLike, first_node: NDArray[np.integer]) -> Array:

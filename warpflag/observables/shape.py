@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from warpflag.observables.arrays import Array, flagella, unit
 from warpflag.observables.phase import segment_tangents
+from warpflag.scene.helix import joint_strain, rest_shape
 
 if TYPE_CHECKING:
     from warpflag.scene import Scene
@@ -46,19 +47,13 @@ def strain(tangents: Array, directors: Array, segment_length: float) -> Array:
         discrete elastic rods, Bergou et al., ACM Trans. Graph. 27, 63 (2008).
     """
     tangents, directors = np.asarray(tangents, float), np.asarray(directors, float)
-    t, u, a, b = tangents[..., :-1, :], tangents[..., 1:, :], directors[..., :-1, :], directors[..., 1:, :]
-    one_plus_cos = 1.0 + np.vecdot(t, u)
-    binormal = np.cross(t, u) * (2.0 / one_plus_cos)[..., None]
-    transported = a - (np.vecdot(u, a) / one_plus_cos)[..., None] * (t + u)
-    twist = np.arctan2(np.vecdot(np.cross(transported, b), u), np.vecdot(transported, b))
-    bend = [np.vecdot(binormal, a + b) / 2, np.vecdot(binormal, np.cross(t, a) + np.cross(u, b)) / 2]
-    return np.stack([*bend, twist], axis=-1) / segment_length
+    return joint_strain(tangents, directors) / segment_length
 
 
 def elastic_energy(
     scene: Scene, positions: Array, directors: Array, motor_axes: Array, first_node: NDArray[np.integer]
 ) -> Array:
-    """Elastic energy of all flagella by term: bending, twist (with the hook's), stretching [pN um], shape [3].
+    """Elastic energy of all flagella by term: bending, twist (both with the hook's), stretching [pN um], shape [3].
 
     Bending and twist are discretised as in `strain`; stretching is (K h/2)(|dr|/h - 1)^2.
 
@@ -75,12 +70,17 @@ def elastic_energy(
     group, energy = scene.flagella, np.zeros(3)
     for spec, rows, axis in zip(scene.resolved_flagella(), flagella(first_node), motor_axes, strict=True):
         h, nodes = spec.segment_length, np.asarray(positions[rows], float)
-        omega = strain(np.vstack([axis, segment_tangents(nodes)]), directors[rows], h)
-        excess = omega[1:] - group.intrinsic_curvature
+        tangents = np.vstack([axis, segment_tangents(nodes)])
+        omega = strain(tangents, directors[rows], h)
+        rest = rest_shape(group.intrinsic_curvature, h, spec.segment_count, group.on_axis)
+        first = np.stack([directors[rows][1], np.cross(tangents[1], directors[rows][1]), tangents[1]], axis=1)
+        stiffness = scene.hook.stiffness * (1.0 + abs(spec.torque) / (scene.hook.stiffening_torque or np.inf))
+        bent = 2.0 * np.cross(axis, first @ rest.helix_axes[:, 0]) / (1.0 + axis @ first @ rest.helix_axes[:, 0])
+        excess = omega[1:] - rest.strain
         hook = group.hook_twist_factor * omega[0, 2] ** 2
         stretch = np.linalg.norm(np.diff(nodes, axis=0), axis=1) / h - 1.0
         energy += [
-            h / 2 * group.bending_rigidity * (excess[:, :2] ** 2).sum(),
+            h / 2 * group.bending_rigidity * (excess[:, :2] ** 2).sum() + stiffness / 2 * bent @ bent,
             h / 2 * group.twist_rigidity * ((excess[:, 2] ** 2).sum() + hook),
             h / 2 * group.stretching_stiffness * stretch @ stretch,
         ]

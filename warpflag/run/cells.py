@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from warpflag_kernels.contact import pair_forces
+from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import elastic
 
 from warpflag.record.cell_state import CellState
@@ -29,7 +30,7 @@ class Cells:
         body_angle: accumulated turn of each body about its axis e_b3 [rad], shape [cell_count].
         body_position: [um], shape [cell_count, 3].
         body_orientation: quaternions (x, y, z, w), shape [cell_count, 4].
-        elastic_energy: bending, twist, stretching [pN um], shape [cell_count, 3].
+        elastic_energy: bending (with the hook's), twist, stretching [pN um], shape [cell_count, 3].
         steric_force: sum of the contact forces between flagella, each pair once [pN], shape [cell_count].
         first_flagellum: cell c has the flagella first_flagellum[c] to first_flagellum[c + 1] - 1.
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1.
@@ -97,6 +98,8 @@ class CellsReader:
         system = self._system
         model, state, chart, control = system.model, system.state, system.chart, system.control
         elastic.elastic_energy(model, state, self._energy)
+        if model.switches.has("hook"):
+            hook.add_energy(model, state, self._energy)
         steric_force = np.zeros(model.cell_count)
         if model.switches.has("steric"):
             pair_forces.steric_magnitudes(model, state, self._force)

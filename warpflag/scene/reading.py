@@ -16,6 +16,7 @@ from warpflag.scene.sections import (
     Flagella,
     FlagellumOverride,
     Fluid,
+    Hook,
     Hydrodynamics,
     Motor,
     Numerics,
@@ -27,7 +28,7 @@ from warpflag.scene.settings import Section, Setting
 __all__ = ["dumps", "load", "loads", "with_values"]
 
 _SECTIONS: dict[str, type[Section]] = {
-    cls.key: cls for cls in (Flagella, Motor, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
+    cls.key: cls for cls in (Flagella, Motor, Hook, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
 }
 _KEYS: dict[str, Setting] = {
     f"{cls.key}.{name}".lstrip("."): setting

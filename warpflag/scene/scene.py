@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from warpflag.base.above import method_from
+from warpflag.scene import attachment
 from warpflag.scene.errors import Problems, SceneError
 from warpflag.scene.sections import (
     Body,
@@ -20,6 +21,7 @@ from warpflag.scene.sections import (
     Flagella,
     FlagellumOverride,
     Fluid,
+    Hook,
     Hydrodynamics,
     Motor,
     Numerics,
@@ -82,6 +84,7 @@ class Scene(Section, key=""):
     flagella: Flagella = dataclasses.field(default_factory=Flagella)
     flagellum: tuple[FlagellumOverride, ...] = ()
     motor: Motor = dataclasses.field(default_factory=Motor)
+    hook: Hook = dataclasses.field(default_factory=Hook)
     fluid: Fluid = dataclasses.field(default_factory=Fluid)
     hydrodynamics: Hydrodynamics = dataclasses.field(default_factory=Hydrodynamics)
     steric: Steric = dataclasses.field(default_factory=Steric)
@@ -94,7 +97,7 @@ class Scene(Section, key=""):
         super().__post_init__()
         object.__setattr__(self, "flagellum", tuple(self.flagellum))
         problems = Problems()
-        for check in (self._check_body, self._check_step, self._check_pair_radius, self._check_start):
+        for check in (self._check_body, self._check_step, self._check_pair_radius, self._check_start, self._check_hook):
             with problems.gathered():
                 check()
         self._check_flagella(problems)
@@ -142,6 +145,14 @@ class Scene(Section, key=""):
             problem = f"must be absent: hydrodynamics.mode = {mode} {why}"
             raise SceneError("hydrodynamics.pair_radius", radius, problem, ["hydrodynamics.mode"])
 
+    def _check_hook(self) -> None:
+        if self.hook.stiffness and not self.motor.bearing_torque:
+            problem = "needs motor.bearing_torque: a hook that resists bending hands its torque to the body"
+            raise SceneError("hook.stiffness", self.hook.stiffness, problem, ["motor.bearing_torque"])
+        if self.hook.stiffening_torque is not None and not self.hook.stiffness:
+            problem = "must be absent where hook.stiffness = 0"
+            raise SceneError("hook.stiffening_torque", self.hook.stiffening_torque, problem, ["hook.stiffness"])
+
     def _check_start(self) -> None:
         if self.start.record is None and self.start.frame != -1:
             raise SceneError("start.frame", self.start.frame, "needs start.record, which is absent")
@@ -164,18 +175,17 @@ class Scene(Section, key=""):
                         told.add(error.key)
                         with problems.gathered():
                             raise
-        if self.steric.enabled:
+        if self.steric.enabled and not any(key and key.endswith("anchor_offset") for key in told):
             with problems.gathered():
                 self._check_distances()
 
     def _check_distances(self) -> None:
         """Two anchors nearer than a filament is thick have flagella inside each other, which no step can part."""
-        thick, radius = 2 * self.flagella.filament_radius, self.body.width / 2
+        thick = 2 * self.flagella.filament_radius
         boxes: dict[tuple[int, ...], list[int]] = {}  # flagella by the box of that size that their anchor is in
         anchors: list[tuple[float, float, float]] = []
         for k, spec in enumerate(self.resolved_flagella()):
-            around = math.radians(spec.azimuth)
-            anchors.append((radius * math.cos(around), radius * math.sin(around), spec.anchor_offset))
+            anchors.append(attachment.anchor(self, spec))
             box = tuple(math.floor(x / thick) for x in anchors[k])
             for step in itertools.product((-1, 0, 1), repeat=3):
                 for j in boxes.get((box[0] + step[0], box[1] + step[1], box[2] + step[2]), ()):
@@ -213,11 +223,11 @@ class Scene(Section, key=""):
             raise SceneError(key, value, problem, [*lengths, "flagella.intrinsic_curvature"])
 
     def _check_anchor(self, k: int, spec: FlagellumSpec) -> None:
-        cylinder = (self.body.length - self.body.width) / 2
-        if 0 <= cylinder < abs(spec.anchor_offset) - 1e-9:
+        pole = self.body.length / 2
+        if self.body.width <= self.body.length and pole < abs(spec.anchor_offset) - 1e-9:
             own = self.flagellum and self.flagellum[k].anchor_offset is not None
             key = f"flagellum.{k}.anchor_offset" if own else "flagella.anchor_offset"
-            problem = f"is beyond the cylinder part of the body, {-cylinder:g} to {cylinder:g} um"
+            problem = f"is beyond the ends of the body, {-pole:g} to {pole:g} um"
             raise SceneError(key, spec.anchor_offset, problem, ["body.length", "body.width"])
 
     def _check_phases(self) -> None:

@@ -40,7 +40,12 @@ class Flagella(Section, key="flagella"):
         derived="all flagella start at the same phase angle",
     )
     anchor_offset: float = number(
-        0.6, "um", -50, 50, "distance of the anchor from the body's middle toward the rear", usual=(1e-3, 5.0)
+        0.6,
+        "um",
+        -50,
+        50,
+        "distance of the anchor from the body's middle toward the rear, length/2 at the pole",
+        usual=(1e-3, 5.0),
     )
     bending_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "A, the paper's")
     twist_rigidity: float = number(3.5, "pN um^2", 1e-3, 1e5, "C, in the paper equal to A")
@@ -54,6 +59,9 @@ class Flagella(Section, key="flagella"):
     )
     filament_radius: float = number(
         0.010, "um", 1e-3, 0.5, "a, not printed but implied by the paper's gamma_R = 4 pi eta a^2"
+    )
+    on_axis: bool = switch(
+        False, "r_0 lies on the axis of the helix, whose amplitude grows from there; else it is a point of the helix"
     )
     hook_twist_factor: float = number(
         3.0, "", 1e-3, 1e3, "twist rigidity of the hook joint over C, the paper's; it bends freely"
@@ -103,6 +111,29 @@ class Motor(Section, key="motor"):
     axis_angle: float = number(55.0, "deg", 0, 180, "motor axis to e_b3, toward the outward normal")
     bearing_torque: bool = switch(
         True, "the body also takes the torque across the motor axis, so that the swimmer is torque-free"
+    )
+
+
+@dataclass(frozen=True)
+class Hook(Section, key="hook"):
+    """The hook between motor and filament: a stub along the motor axis m that turns with the body, and a joint.
+
+    The flagellum begins at its end. The paper has neither length nor stiffness: its hook is a universal joint on the
+    body's surface. Measured: 0.055 to 0.06 um long. Its bending energy is (stiffness/2) |2 tan(beta/2)|^2, beta between
+    m and the axis of the helix at rest, which is fixed in the first segment.
+    """
+
+    length: float = number(0.0, "um", 0, 1, "of the stub; the flagellum begins at its end", usual=(1e-3, 1.0))
+    stiffness: float = number(
+        0.0, "pN um/rad", 0, 1e4, "of bending; EI over the length: 0.65 relaxed, 4 loaded, 0 as in the paper"
+    )
+    stiffening_torque: float | None = number(
+        None,
+        "pN um",
+        1e-4,
+        1e4,
+        "T_s: the stiffness grows by 1 + |motor torque|/T_s",
+        derived="the stiffness does not depend on the torque",
     )
 
 

@@ -147,7 +147,7 @@ class ImplicitStepper:
         if model.switches.pairs != "none":
             step_flow.build(model, state, self.flow, self.contacts if self._touching else None)
         self._evaluate(in_single=step_flow.stores_pairs(model))
-        hessian.joint_stiffness(model, state, self.stiffness)
+        linear_system.set_stiffness(model, state, self.stiffness)
         linear_system.factorise(model, state, self.stiffness, band)
         solution = self._solve(x.last_at_first, x.zero, first=True)
         # The second, where the first one led.

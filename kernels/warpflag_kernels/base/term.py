@@ -41,7 +41,10 @@ class Term:
 
         contact: whether an implicit step solves for the term's forces instead of evaluating them.
         linearised: the term whose forces are this one's first variation; its launch is
-            `launch(model, state, stiffness, increment)`. None: the force does not depend on the pose.
+            `launch(model, state, stiffness, increment)`. None: the force does not depend on the pose, or its change is
+            found with that of another term.
+        stiffness: sets or adds to the second derivatives of the energy in the matrix of an implicit step,
+            `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Term:
     functions: Callable[[Precision], SimpleNamespace] = _nothing
     contact: bool = False
     linearised: "Term | None" = None
+    stiffness: Callable[..., None] | None = None
 
 
 def variant(terms: Sequence[Term]) -> str:

@@ -29,14 +29,14 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Rod:
-        """Per flagellum [K]."""
+        """Per flagellum [K], and the intrinsic strain of every joint."""
 
         segment_length: wp.array(dtype=real)  # h [um]
         bending_rigidity: wp.array(dtype=real)  # A [pN um^2]
         twist_rigidity: wp.array(dtype=real)  # C [pN um^2]
         hook_rigidity: wp.array(dtype=real)  # twist rigidity of the motor joint [pN um^2]
         stretching_stiffness: wp.array(dtype=real)  # K [pN]
-        rest_strain: wp.array(dtype=vec3)  # h Omega^0 [rad]
+        rest_strain: wp.array(dtype=vec3)  # [E], h Omega^0 of the joint after segment e [rad]
 
     @wp.struct
     class Motor:
@@ -45,6 +45,14 @@ def structs(p: Precision) -> SimpleNamespace:
         torque: wp.array(dtype=real)  # T_m [pN um]
         axis: wp.array(dtype=vec3)  # m
         anchor: wp.array(dtype=vec3)  # r_0 [um]
+
+    @wp.struct
+    class Hook:
+        """Bending of the hook, per flagellum [K]."""
+
+        stiffness: wp.array(dtype=real)  # without a torque [pN um/rad]
+        stiffening: wp.array(dtype=real)  # 1/T_s: how much it grows by the motor's torque [1/(pN um)]
+        helix_axis: wp.array(dtype=vec3)  # of the flagellum at rest, in the axes of segment 1
 
     @wp.struct
     class Drag:
@@ -94,6 +102,7 @@ def structs(p: Precision) -> SimpleNamespace:
         first_flagellum: wp.array(dtype=wp.int32)  # [C + 1]
         rod: Rod
         motor: Motor
+        hook: Hook
         drag: Drag
         pairs: Pairs
         steric: Steric

@@ -6,6 +6,13 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState
 from warpflag_kernels.implicit import block_band, body_coupling
 
 
+def set_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
+    """Second derivatives of the energies at the state's pose, of all terms that have them, into `stiffness`."""
+    for term in model.terms:
+        if term.stiffness is not None:
+            term.stiffness(model, state, stiffness)
+
+
 def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any) -> None:
     """Assembles and factorises the system of every cell; `singular` tells of a pivot that is not positive.
 

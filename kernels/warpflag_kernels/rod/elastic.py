@@ -54,7 +54,7 @@ def functions(p: Precision) -> SimpleNamespace:
             return
         a2 = wp.cross(t, a1)
         b2 = wp.cross(u, b1)
-        rest = model.rod.rest_strain[k]
+        rest = model.rod.rest_strain[e]
         w1 = real(0.5) * wp.dot(kb, a1 + b1)
         w2 = real(0.5) * wp.dot(kb, a2 + b2)
         stiffness = model.rod.bending_rigidity[k] * per_length
@@ -190,7 +190,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             if e == first:
                 twist = real(0.5) * model.rod.hook_rigidity[k] / h * w[2] * w[2]
             else:
-                d = w - model.rod.rest_strain[k]
+                d = w - model.rod.rest_strain[e]
                 bend = real(0.5) * model.rod.bending_rigidity[k] / h * (d[0] * d[0] + d[1] * d[1])
                 twist = real(0.5) * model.rod.twist_rigidity[k] / h * d[2] * d[2]
         energy_out[e] = vec3(bend, twist, stretch)
@@ -216,5 +216,6 @@ ELASTIC = Term(
     launch=joint_gradients,
     functions=functions,
     linearised=Term("elastic change", launch=hessian.joint_changes, functions=_change_functions),
+    stiffness=hessian.joint_stiffness,
 )
 BEARING = Term("bearing", functions=_bearing_functions, linearised=Term("bearing", functions=_bearing_functions))

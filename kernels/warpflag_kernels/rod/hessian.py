@@ -85,7 +85,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         half = real(0.5)
         quarter = real(0.25)
         c3 = model.rod.twist_rigidity[k] / h
-        w3 = twist - model.rod.rest_strain[k][2]
+        w3 = twist - model.rod.rest_strain[i][2]
         if i == first:
             c3 = model.rod.hook_rigidity[k] / h
             w3 = twist
@@ -100,8 +100,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         w2 = half * wp.dot(kb, a2 + b2)
         if i > first:
             c = model.rod.bending_rigidity[k] / h
-            m1 = c * (w1 - model.rod.rest_strain[k][0])
-            m2 = c * (w2 - model.rod.rest_strain[k][1])
+            m1 = c * (w1 - model.rod.rest_strain[i][0])
+            m2 = c * (w2 - model.rod.rest_strain[i][1])
         d1 = (a1 + b1) / chi
         d2 = (a2 + b2) / chi
         # Derivatives of w1, w2 with respect to the spins.

@@ -2,11 +2,12 @@
 
 from warpflag_kernels.base.term import Term
 from warpflag_kernels.contact.pair_forces import BODY_CONTACT, STERIC
+from warpflag_kernels.motor.hook import HOOK
 from warpflag_kernels.motor.torque import MOTOR
 from warpflag_kernels.rod.elastic import BEARING, ELASTIC
 from warpflag_kernels.rod.external import EXTERNAL
 
-TERMS = (MOTOR, ELASTIC, BEARING, STERIC, BODY_CONTACT, EXTERNAL)
+TERMS = (MOTOR, ELASTIC, BEARING, HOOK, STERIC, BODY_CONTACT, EXTERNAL)
 
 
 def terms_named(names: tuple[str, ...]) -> tuple[Term, ...]:
