@@ -95,13 +95,13 @@ def test_body_contact_pushes_nodes_out_and_can_be_switched_off(device, precision
     off = with_values(on, {"body.contact": False})
     start = initial_state(on)
     nodes = [x.copy() for x in start.positions]
-    nodes[0][4] = [0.0, 0.39, 0.2]  # 0.01 um below the surface
+    nodes[0][4] = [0.0, 0.405, 0.2]  # 5 nm from the surface
     start = dataclasses.replace(start, positions=tuple(nodes))
     push = evaluated(on, start, device).forces - evaluated(off, start, device).forces
     gaps = body_gaps(on, start, start.positions[0])
-    assert np.isclose(gaps[4], -0.01)
+    assert np.isclose(gaps[4], 0.005)
     # Straight out at that node, by the linear law: 155.4 pN + 7.424e4 pN/um (0.028 um - gap).
-    expected = np.array([0.0, 155.4 + 7.424e4 * (0.028 + 0.01), 0.0])
+    expected = np.array([0.0, 155.4 + 7.424e4 * (0.028 - 0.005), 0.0])
     assert np.abs(push[4] - expected).max() < 2e-3 * expected[1]
     untouched = np.concatenate([np.full(1, np.inf), *(body_gaps(on, start, x[1:]) for x in start.positions)])
     untouched = np.insert(untouched, len(nodes[0]), np.inf) > 0.045

@@ -117,7 +117,7 @@ def test_guards_leave_the_permitted_alone(change, device, precision):
 
 @pytest.mark.parametrize(("degrees", "kind"), [(160, None), (168, Fault.FOLD), (179.9, Fault.FOLD)])
 def test_a_joint_folded_back_is_seen(degrees, kind, device, precision):
-    scene = cell({"steric.enabled": False}, precision)
+    scene = cell({"steric.enabled": False, "body.contact": False}, precision)
     nodes = []
     for spec in scene.resolved_flagella():
         anchor, m = attachment(scene, spec)

@@ -21,7 +21,7 @@ from warpflag.model.geometry import InitialState
 from warpflag.model.terms import SCENE_TERMS, switches_of
 from warpflag.scene import Flagella, FlagellumSpec, Scene, SceneError, attachment
 from warpflag.scene.helix import rest_shape
-from warpflag.scene.resistance import filament_mobility, pair_radius, spheroid_mobility
+from warpflag.scene.resistance import filament_mobility, pair_radius, spheroid_mobility, steric_diameter
 
 __all__ = ["build_chart", "build_control", "build_model", "build_state", "plan_of"]
 
@@ -99,7 +99,7 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
         m.pairs.radius = reals([pair_radius(scene) for scene in scenes])
         m.pairs.mobility = reals([1 / (8 * np.pi * scene.fluid.viscosity) for scene in scenes])
     m.steric.strength = reals([scene.steric.strength for scene in scenes])
-    m.steric.diameter = reals([_steric_diameter(scene) for scene in scenes])
+    m.steric.diameter = reals([steric_diameter(scene) for scene in scenes])
 
     m.body.half_length = reals([(scene.body.length - scene.body.width) / 2 for scene in scenes])
     m.body.radius = reals([scene.body.width / 2 for scene in scenes])
@@ -180,8 +180,3 @@ def _body_mobility(scene: Scene) -> tuple[float, float, float, float]:
     spins = scene.body.axial_rotation and not scene.body.anchored
     tumbles = not scene.body.anchored
     return m.along * moves, m.across * moves, m.spin * spins, m.tumble * tumbles
-
-
-def _steric_diameter(scene: Scene) -> float:
-    given = scene.steric.diameter
-    return 4 * scene.flagella.filament_radius if given is None else given

@@ -9,6 +9,7 @@ does not print these choices; its hook has no length.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,8 @@ __all__ = [
     "DEFAULT_PHASE",
     "DiscreteHelix",
     "InitialState",
+    "at_time_0",
+    "flagellum_at_rest",
     "ground_state",
     "initial_state",
     "phase_difference_at",
@@ -41,7 +44,8 @@ class InitialState:
 
     positions: nodes r_0..r_N per flagellum, lab [um], shape [N + 1, 3]. directors: e1 of the motor tripod and
     of segments 1..N, shape [N + 1, 3]. body_position [um], shape [3]; body_orientation, quaternion
-    (x, y, z, w) from body axes to lab axes, shape [4]; time [s].
+    (x, y, z, w) from body axes to lab axes, shape [4]; time [s]. notes: what was changed of a scene's own shape to
+    begin clear of body and other flagella, a line each.
     """
 
     positions: tuple[Array, ...]
@@ -49,6 +53,7 @@ class InitialState:
     body_position: Array
     body_orientation: Array
     time: float = 0.0
+    notes: tuple[str, ...] = ()
 
 
 def initial_state(scene: Scene) -> InitialState:
@@ -59,11 +64,18 @@ def initial_state(scene: Scene) -> InitialState:
     and 1 have it. Raises SceneError where no such delta exists, and where a motor axis points against the
     first segment, so that the hook joint is undefined.
     """
-    specs = scene.resolved_flagella()
     shift = _phase_shift(scene)
+    specs = [with_phase(spec, k, shift) for k, spec in enumerate(scene.resolved_flagella())]
+    return at_time_0(scene, [flagellum_at_rest(scene, spec) for spec in specs])
+
+
+def at_time_0(scene: Scene, shapes: Sequence[tuple[Array, Array]]) -> InitialState:
+    """The cell at the origin with these flagella: nodes, and e1 of segments 1..N; tripods without twist of the hook.
+
+    Raises SceneError where a motor axis points against the first segment.
+    """
     positions, directors = [], []
-    for k, spec in enumerate(specs):
-        nodes, e1 = _flagellum(scene, with_phase(spec, k, shift))
+    for k, (spec, (nodes, e1)) in enumerate(zip(scene.resolved_flagella(), shapes, strict=True)):
         tripod = _tripod(scene, k, spec, e1[0], nodes[1] - nodes[0])
         positions.append(nodes)
         directors.append(np.vstack([tripod, e1]))
@@ -81,7 +93,7 @@ def phase_difference_at(scene: Scene, shift: float) -> float:
     Over the segments that both have; segments with antiparallel tangents are left out.
     """
     (nodes_a, e1_a), (nodes_b, e1_b) = (
-        _flagellum(scene, with_phase(spec, k, shift)) for k, spec in enumerate(scene.resolved_flagella()[:2])
+        flagellum_at_rest(scene, with_phase(spec, k, shift)) for k, spec in enumerate(scene.resolved_flagella()[:2])
     )
     common = min(len(e1_a), len(e1_b))
     tangents = [np.diff(nodes[: common + 1], axis=0) for nodes in (nodes_a, nodes_b)]
@@ -116,7 +128,7 @@ def _phase_shift(scene: Scene) -> float:
     return float((low + high) / 2)
 
 
-def _flagellum(scene: Scene, spec: FlagellumSpec) -> tuple[Array, Array]:
+def flagellum_at_rest(scene: Scene, spec: FlagellumSpec) -> tuple[Array, Array]:
     """Nodes [um], shape [N + 1, 3], and e1 of segments 1..N, shape [N, 3], on a body at the origin."""
     rest = rest_shape(
         scene.flagella.intrinsic_curvature, spec.segment_length, spec.segment_count, scene.flagella.on_axis

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from warpflag.base import rotations
+from warpflag.model.clear_start import body_gaps, clear_start
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.record import Frame, Record, RecordError
-from warpflag.scene import Body, Scene, SceneError, attachment
+from warpflag.scene import Scene, SceneError, attachment
 
-__all__ = ["shape_of_frame", "starting_state"]
+__all__ = ["check_outside", "shape_of_frame", "starting_state"]
 
 _ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
 
@@ -17,14 +18,14 @@ _ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
 def starting_state(scene: Scene) -> InitialState:
     """The shape that a scene asks for, at time 0.
 
+    Where the scene's own shape would begin inside the body or on another flagellum, it begins a little otherwise, see
+    `clear_start`; its notes say how.
+
     Raises SceneError where `start.record` can't be read or holds another cell than the scene's, and where the scene's
-    own shape begins inside the body.
+    own shape can't begin clear.
     """
     if scene.start.record is None:
-        start = initial_state(scene)
-        if scene.body.contact:
-            _check_outside(scene, start)
-        return start
+        return clear_start(scene, initial_state(scene))
     try:
         with Record(scene.start.record) as record:
             if scene.start.frame >= record.frame_count:
@@ -53,24 +54,16 @@ def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
     )
 
 
-def _check_outside(scene: Scene, start: InitialState) -> None:
-    """Nodes r_1..r_N well below the body's surface would be torn out of it by the contact force in the first step."""
-    for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
-        depth = _depths(scene.body, nodes[1:])
-        if depth.max() > 0.0:
-            problem = (
-                f"starts flagellum {k} inside the body: node {int(depth.argmax()) + 1} is {depth.max():.3g} um deep"
-            )
-            related = ["flagella.opening_angle", "flagella.phase_difference", f"flagellum.{k}.azimuth"]
-            raise SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
-
-
-def _depths(body: Body, points: np.ndarray) -> np.ndarray:
-    """How far points in body axes lie below the body's surface [um], shape [count]; negative outside."""
-    half = (body.length - body.width) / 2
-    axis_points = np.zeros_like(points)
-    axis_points[:, 2] = np.clip(points[:, 2], -half, half)
-    return body.width / 2 - np.linalg.norm(points - axis_points, axis=1)
+def check_outside(scene: Scene, start: InitialState) -> None:
+    """Refuses a start with nodes inside the body, out of which the contact force would tear them in the first step."""
+    if not scene.body.contact:
+        return
+    to_body = rotations.matrix(start.body_orientation)
+    for k, nodes in enumerate(start.positions):
+        gaps = body_gaps(scene.body, (nodes[1:] - start.body_position) @ to_body)
+        if gaps.min() < 0.0:
+            deep = f"node {int(gaps.argmin()) + 1} is {-gaps.min():.3g} um deep"
+            raise SceneError("body.contact", True, f"the given start has flagellum {k} inside the body: {deep}")
 
 
 def _check_anchors(scene: Scene, start: InitialState) -> None:

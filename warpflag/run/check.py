@@ -47,6 +47,7 @@ def report(scene: Scene, device: str | None = None) -> str:
         f"stepper {scene.numerics.stepper}, step at most {longest:.3g} s",
         f"time {cost:.3g} ms per simulated ms, {cost * scene.duration:.3g} s in all, from the first steps on this "
         "machine; contacts add to it",
+        *simulation.notes[0],
     ]
     return dumps(scene) + "\n# What it requires\n" + "".join(f"# {line}\n" for line in lines)
 

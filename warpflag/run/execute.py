@@ -98,6 +98,9 @@ class Run:
                 watch(reached)
             stop.check()
 
+        for member, notes in zip(self.members, self.simulation.notes, strict=True):
+            for note in () if quiet else notes:
+                print(f"warpflag: {member.scene.name}: {note}", file=sys.stderr)
         try:
             stop.check()
             self._prepare(quiet, stop)
@@ -228,6 +231,7 @@ class Run:
             "rejected_steps": copied["stepper.rejected"][0] if "stepper.rejected" in copied else 0,
             "evaluations": copied["stepper.evaluations"][0],
             "batch": len(self.members),
+            "start": list(simulation.notes[cell]),
             "guards": {"steps_between_checks": simulation.system.guard.interval.numpy()[cell], "violated": violated},
             "precision": scene.numerics.precision,
             "stepper": scene.numerics.stepper,

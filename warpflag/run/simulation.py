@@ -18,6 +18,7 @@ from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag.base.device import LAUNCHING, alone, find_device
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
+from warpflag.model.start import check_outside
 from warpflag.model.terms import supplied_power
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
@@ -71,8 +72,11 @@ class Simulation:
         self.scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
         if starts is None:
             starts = starting_states(self.scenes)
-        elif isinstance(starts, InitialState):
-            starts = [starts]
+        else:
+            starts = [starts] if isinstance(starts, InitialState) else list(starts)
+            for scene, start in zip(self.scenes, starts, strict=True):
+                check_outside(scene, start)
+        self.notes = [start.notes for start in starts]
         model = build_model(self.scenes, plan or plan_of(self.scenes, find_device(device), strict))
         self.device, precision = model.device, model.precision
         state = build_state(model)

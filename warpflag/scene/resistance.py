@@ -13,7 +13,14 @@ import numpy as np
 
 from warpflag.scene import Scene, SceneError
 
-__all__ = ["FilamentMobility", "SpheroidMobility", "filament_mobility", "pair_radius", "spheroid_mobility"]
+__all__ = [
+    "FilamentMobility",
+    "SpheroidMobility",
+    "filament_mobility",
+    "pair_radius",
+    "spheroid_mobility",
+    "steric_diameter",
+]
 
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _ZETA_3 = 1.2020569031595942
@@ -97,6 +104,12 @@ def pair_radius(scene: Scene) -> float:
     if scene.hydrodynamics.mode == "consistent":
         return max(_consistent_radius(spec.segment_length, radius) for spec in scene.resolved_flagella())
     return max(radius, _drag(scene)[1] * h / (6 * math.pi * eta))
+
+
+def steric_diameter(scene: Scene) -> float:
+    """sigma of the contacts [um]: given, or four filament radii."""
+    given = scene.steric.diameter
+    return 4 * scene.flagella.filament_radius if given is None else given
 
 
 def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
