@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 from pathlib import Path
 
 import numpy as np
+import pytest
+from warpflag_kernels.stepping import frame_slots
 
 from warpflag.record import Record
 from warpflag.run import run
@@ -28,15 +31,24 @@ def summary(directory: Path) -> dict:
     return json.loads((directory / "summary.json").read_text())
 
 
-def ended_at(started: run.Run, frame: int, number: int = signal.SIGINT) -> run.Outcome:
-    """How a run ends that gets a signal once it has advanced to a frame, which is not recorded yet."""
-    scene = started.simulation.scenes[0]
+@contextlib.contextmanager
+def frame_by_frame():
+    """Simulations made within hand over every frame by itself, and not in blocks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frame_slots, "MOST_SLOTS", 1)
+        yield
 
-    def watch(reached: float) -> None:
-        if reached > scene.duration * (frame - 0.5) / scene.frames:
+
+def ended_at(started: run.Run, frames: int, number: int = signal.SIGINT) -> run.Outcome:
+    """How a run ends that gets a signal once it has recorded so many frames."""
+    recorder = started.members[0].recorder
+
+    def watch(_reached: float) -> None:
+        if recorder.frame_count >= frames:
             signal.raise_signal(number)
 
-    return started.execute_all(quiet=True, watch=watch)[0]
+    with frame_by_frame():
+        return started.execute_all(quiet=True, watch=watch)[0]
 
 
 def arrays(directory: Path) -> dict[str, np.ndarray]:

@@ -268,8 +268,8 @@ def _compile(options: argparse.Namespace) -> int:
 
     for scene in [load(path) for path in options.scenes] or [Scene(name="defaults")]:
         simulation = Simulation(scene, device=options.device)
-        simulation.prepare()
-        next(simulation.cell_frames())  # and the kernels that measure a frame
+        simulation.prepare(recording=True)
+        next(simulation.cell_frames())  # and the kernels that measure the first frame
         print(f"{scene.name}: kernels are compiled")
     return DONE
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import warpflag
-from tests.runs import arrays, assert_same_frames, ended_at, executed, small, summary
+from tests.runs import arrays, assert_same_frames, ended_at, executed, frame_by_frame, small, summary
 from warpflag.record import Record, RecordError
 from warpflag.run import member, run
 from warpflag.run.checkpoint import CheckpointError
@@ -35,7 +35,7 @@ def test_an_interrupted_run_resumes_to_the_same_record(stop, tmp_path):
         assert record.frame_count == stop
     assert (summary(halved)["status"], summary(halved)["frames"]) == ("interrupted", stop)
     resumed = run.resume(str(halved))
-    assert resumed.simulation.times[0] == pytest.approx((stop - 1) * 1e-4, abs=1e-12)
+    assert (stop - 1) * 1e-4 <= resumed.simulation.times[0] + 1e-12 < stop * 1e-4
     assert resumed.execute(quiet=True).status == "done"
     assert_same_frames(whole, halved)
     for name in ("steps", "evaluations", "rejected_steps"):
@@ -63,7 +63,7 @@ def test_resume_goes_back_to_the_last_checkpoint(tmp_path):
     ended_at(run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0), 7)
     max(halved.glob("checkpoint-*")).unlink()
     before = run.resume(str(halved))
-    assert before.simulation.times[0] == pytest.approx(5e-5)
+    assert 5e-5 <= before.simulation.times[0] < 6e-5
     assert before.execute(quiet=True).status == "done"
     assert_same_frames(whole, halved)
 
@@ -80,7 +80,7 @@ def test_signals_that_terminate_leave_a_resumable_run(number, tmp_path):
 
 def test_the_wall_time_ends_a_run(tmp_path):
     scene = small({"duration": 1.0, "frames": 100_000})
-    outcome = run.start(scene, str(tmp_path / "made"), "cpu").execute(quiet=True, stop=Stop(max_wall=0.3))
+    outcome = run.start(scene, str(tmp_path / "made"), "cpu").execute(quiet=True, stop=Stop(max_wall=1.0))
     assert outcome.status == "terminated" and "wall time" in outcome.message
     with Record(tmp_path / "made") as record:
         assert 1 < record.frame_count < 100_000
@@ -197,7 +197,8 @@ def test_a_killed_run_resumes_where_it_was(tmp_path):
         kept = record.frame_count
     until = (kept + 5) * 1e-5
     resumed = run.resume(str(tmp_path / "made"))
-    resumed.execute_all(quiet=True, watch=lambda reached: raise_signal_beyond(until, reached))
+    with frame_by_frame():
+        resumed.execute_all(quiet=True, watch=lambda reached: raise_signal_beyond(until, reached))
     whole = executed(small({"duration": until, "frames": kept + 5}), tmp_path / "whole")
     found, expected = arrays(tmp_path / "made"), arrays(whole)
     assert len(found["times"]) >= kept + 5

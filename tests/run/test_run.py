@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.runs import arrays, executed, small, summary
+from tests.runs import arrays, executed, frame_by_frame, small, summary
 from warpflag import observables
 from warpflag.record import Record
 from warpflag.run import run
@@ -72,7 +72,8 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
         if reached > 2.5e-7:
             started.simulation.system.control.longest_step.fill_(1e-7)
 
-    (outcome,) = started.execute_all(quiet=True, watch=watch)
+    with frame_by_frame():
+        (outcome,) = started.execute_all(quiet=True, watch=watch)
     assert outcome.status == "stopped"
     assert "\n" not in outcome.message and "flagellum" in outcome.message and "numerics.time_step" in outcome.message
     said = summary(tmp_path / "made")

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from tests.runs import assert_same_frames, ended_at, executed, small
+from tests.runs import assert_same_frames, ended_at, executed, frame_by_frame, small
 from warpflag.record import Frame, Record
 from warpflag.record.recorder import Recorder
 from warpflag.run import run
@@ -27,9 +27,10 @@ def test_a_restored_simulation_goes_on_with_the_same_bits(values, device):
     scene = small(values)
     one = Simulation(scene, device=device)
     frames, kept = [], {}
-    for index, frame in enumerate(one.frames(scene.duration)):
-        frames.append(frame)
-        kept[index] = one.checkpoint()
+    with frame_by_frame():
+        for index, frame in enumerate(one.frames(scene.duration)):
+            frames.append(frame)
+            kept[index] = one.checkpoint()
     for index in (0, 3, 7):
         other = Simulation(scene, device=device)
         other.restore(kept[index])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,12 @@ from warpflag_kernels.contact import pair_forces
 from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import elastic
 
-from warpflag.record.cell_state import CellState
+from warpflag.model.terms import supplied_power
+from warpflag.record.cell_state import CellState, Evaluation
+from warpflag.scene import Scene
 from warpflag.stepping import System
 
-__all__ = ["Cells", "CellsReader"]
+__all__ = ["Cells", "CellsReader", "evaluation_of"]
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,10 @@ class CellsReader:
         self._cell_of_node = data.cell_of.numpy()
 
     def read(self) -> Cells:
-        """All cells at the times that they have reached."""
+        """All cells at the times that they have reached; no cell is active afterwards."""
         system = self._system
         model, state, chart, control = system.model, system.state, system.chart, system.control
+        state.data.active.fill_(1)
         elastic.elastic_energy(model, state, self._energy)
         if model.switches.has("hook"):
             hook.add_energy(model, state, self._energy)
@@ -104,6 +108,7 @@ class CellsReader:
         if model.switches.has("steric"):
             pair_forces.steric_magnitudes(model, state, self._force)
             steric_force = 0.5 * self._sums(self._force)
+        state.data.active.zero_()
         centres = chart.base.body_position.numpy().copy()
         return Cells(
             time=control.time.numpy().copy(),
@@ -124,3 +129,36 @@ class CellsReader:
     def _sums(self, values: Any) -> np.ndarray:
         """The sum over the nodes of each cell, shape [cell_count, ...]; independent of the other cells to the bit."""
         return np.add.reduceat(values.numpy().astype(np.float64), self._first_node_of_cell, axis=0)
+
+
+def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -> Evaluation:
+    """Forces and velocities that the right-hand side has just left on the device, of one cell.
+
+    Args:
+        system: of the batch.
+        scene: of the cell.
+        flagella: of the cell.
+        nodes: of the cell.
+    """
+    model, state = system.model, system.state.data
+    first_node = model.data.first_node.numpy()[flagella.start : flagella.stop + 1]
+
+    def host(array: Any, part: Any) -> np.ndarray:
+        return array.numpy()[part].astype(np.float64)
+
+    torques = host(state.spin_torque, nodes)
+    cell = int(model.data.cell_of.numpy()[nodes.start])
+    found = Evaluation(
+        forces=host(state.force, nodes),
+        torques=torques,
+        velocities=host(state.velocity, nodes),
+        spins=np.repeat(model.data.drag.spin_mobility.numpy()[flagella], np.diff(first_node)) * torques,
+        tangents=host(state.pose.tangent, nodes),
+        first=first_node[:-1] - nodes.start,
+        supplied={},
+        body_force=host(state.flagellum_force, flagella).sum(axis=0),
+        body_torque=host(state.flagellum_torque, flagella).sum(axis=0),
+        body_velocity=host(state.body_velocity, cell),
+        body_spin=host(state.body_spin, cell),
+    )
+    return dataclasses.replace(found, supplied=supplied_power(scene, found))

@@ -50,7 +50,7 @@ class Run:
         self.members, self.movies = list(members), movies
         self._given_interval = checkpoint_seconds
         self._simulation = simulation
-        # The last copy of all cells at a frame, and when it was taken: what a checkpoint is written from.
+        # The last copy of all cells after a block of frames, and when it was taken: what a checkpoint is written from.
         self._copy: dict[str, np.ndarray] = {}
         self._copied_at = -math.inf
 
@@ -88,11 +88,12 @@ class Run:
         return [member.outcome or Outcome("failed", "never ran") for member in self.members]
 
     def _execute(self, quiet: bool, stop: Stop, watch: Callable[[float], None] | None) -> None:
-        progress = Progress(sum(member.scene.duration for member in self.members), quiet=quiet)
+        durations = [member.scene.duration for member in self.members]
+        progress = Progress(sum(durations), quiet=quiet)
         ended: Ended | None = None
 
         def look() -> None:
-            reached = float(self.simulation.times.sum())
+            reached = float(np.minimum(self.simulation.times, durations).sum())
             progress.update(reached)
             if watch is not None:
                 watch(reached)
@@ -123,7 +124,7 @@ class Run:
             timer.start()
         stop.at_once = True
         try:
-            self.simulation.prepare()
+            self.simulation.prepare(recording=True)
         except Exception:
             stop.check()  # what a signal raises amid other code may come out as another error
             raise
@@ -134,9 +135,12 @@ class Run:
     def _record(self, look: Callable[[], None]) -> None:
         given = self._given_interval
         saved, interval = monotonic(), _CHECKPOINT_SECONDS if given is None else given
-        for frames in self.simulation.cell_frames(watch=look):
+        for block in self.simulation.frame_blocks(watch=look):
             at_end = {
-                c for c, frame in frames.items() if self._guarded(c, lambda c=c, f=frame: self.members[c].write(f))
+                c
+                for frames in block
+                for c, frame in frames.items()
+                if self._guarded(c, lambda c=c, f=frame: self.members[c].write(f))
             }
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
             if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):

@@ -1,84 +1,274 @@
-"""From the states of cells to frames of their records: observables of one moment and of the interval before it."""
+"""From cells on a device to frames of their records: when they are due, and the observables of each.
+
+Frames are taken on the device, inside steps (`warpflag_kernels.stepping.dense_output`), and read in blocks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from warpflag_kernels.stepping import dense_output, frame_slots
 
 from warpflag.observables.cells import body_speeds, bundle_lengths, phase_differences
 from warpflag.record import Frame
 from warpflag.run.cells import Cells
+from warpflag.scene import Scene
+from warpflag.stepping import Stepper, System
 
-__all__ = ["frames_of"]
+__all__ = ["Frames"]
+
+_NEVER = 1e9  # [s]; finite, since fixed steps divide what is left of the time
+_ROUNDING = 1e-6  # of a frame interval: times this close are the same
+# What rates are differences of; it is kept of the last frame of every cell.
+_MOTION = ("time", "body_position", "body_orientation", "body_angle", "motor_angle")
 
 
-def frames_of(
-    now: Cells, before: Cells | None, lengths: Sequence[float], wanted: Sequence[int] | np.ndarray
-) -> dict[int, Frame]:
-    """The frames of the wanted cells, by cell; observables are measured for all cells of one structure at once.
+@dataclass(frozen=True)
+class _Block:
+    """Frames of all cells, some after the other; arrays as in `Cells`, with the frames [m] before all other axes.
 
-    Rates are differences between two frames, so the first one has none: NaN there.
+    Attributes:
+        counts: how many of them each cell has, shape [cell_count].
+        before: the motion at the frame before each, entry [m] of every array.
+    """
+
+    counts: np.ndarray
+    time: np.ndarray
+    step: np.ndarray
+    positions: np.ndarray
+    directors: np.ndarray
+    motor_angle: np.ndarray
+    body_angle: np.ndarray
+    body_position: np.ndarray
+    body_orientation: np.ndarray
+    elastic_energy: np.ndarray
+    steric_force: np.ndarray
+    before: Mapping[str, np.ndarray]
+
+
+class Frames:
+    """The frames of every cell, each at multiples of its own scene's duration / frames.
 
     Args:
-        now: the cells at this frame.
-        before: the cells at the frame before it; None at the first.
-        lengths: contour length of a flagellum of each cell, over which the steric force is distributed [um].
-        wanted: numbers of the cells whose frames are asked for.
+        system: what is advanced.
+        scenes: one per cell.
+
+    Attributes:
+        index: number of the last frame that is behind each cell, -1 before the first, shape [cell_count].
+        last: motion at the last frame of each cell, by name.
     """
-    frames: dict[int, Frame] = {}
-    for cells in _by_structure(now, wanted):
-        measured = _measured(now, before, np.array(cells))
-        for row, c in enumerate(cells):
-            observables = {name: values[row] for name, values in measured.items()}
-            observables["steric_force_density"] = now.steric_force[c] / lengths[c]
-            flagella, nodes = now.flagella(c), now.nodes(c)
-            frames[c] = Frame(
-                time=float(now.time[c]),
-                step=int(now.step[c]),
-                positions=now.positions[nodes],
-                directors=now.directors[nodes],
-                motor_angle=now.motor_angle[flagella],
-                body_position=now.body_position[c],
-                body_orientation=now.body_orientation[c],
-                observables=observables,
-            )
-    return frames
 
-
-def _by_structure(cells: Cells, wanted: Sequence[int] | np.ndarray) -> list[list[int]]:
-    """The wanted cells in groups whose flagella have the same numbers of nodes."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for c in (int(c) for c in wanted):
-        own = cells.flagella(c)
-        groups.setdefault(tuple(np.diff(cells.first_node[own.start : own.stop + 1])), []).append(c)
-    return list(groups.values())
-
-
-def _measured(now: Cells, before: Cells | None, cells: np.ndarray) -> dict[str, np.ndarray]:
-    """Observables of cells of one structure by name, shape [cell_count] or [cell_count, flagellum_count]."""
-    own = now.flagella(cells[0])
-    first_node = now.first_node[own.start : own.stop + 1] - now.first_node[own.start]
-    flagella = now.first_flagellum[cells][:, None] + np.arange(len(first_node) - 1)
-    nodes = now.first_node[now.first_flagellum[cells]][:, None] + np.arange(first_node[-1])
-    positions = now.positions[nodes]
-    measured: dict[str, np.ndarray] = {}
-    if len(first_node) > 2:
-        measured["phase_difference"] = phase_differences(positions, now.directors[nodes], first_node)
-    measured["bundle_length"] = bundle_lengths(positions, first_node)
-    measured["elastic_energy"] = now.elastic_energy[cells].sum(axis=1)
-    if before is None:
-        nothing = np.full(len(cells), np.nan)
-        return measured | {
-            "body_speed": nothing,
-            "body_rate": nothing,
-            "motor_rate": np.full(flagella.shape, np.nan),
+    def __init__(self, system: System, scenes: Sequence[Scene]) -> None:
+        self._system = system
+        data = system.model.data
+        self._first_flagellum, self._first_node = data.first_flagellum.numpy(), data.first_node.numpy()
+        self._cell_of_node = data.cell_of.numpy()
+        self._first_node_of_cell = self._first_node[self._first_flagellum[:-1]]
+        self._durations = np.array([scene.duration for scene in scenes])
+        self._counts = np.array([scene.frames for scene in scenes])
+        self._lengths = [float(np.mean([spec.length for spec in scene.resolved_flagella()])) for scene in scenes]
+        self._dense: frame_slots.DenseOutput | None = None
+        self._end_steps = False  # at frames
+        self._wanted = np.zeros((len(scenes), 0))
+        cells = len(scenes)
+        self.index = np.full(cells, -1, dtype=np.int64)
+        self.last = {
+            "time": np.zeros(cells),
+            "body_position": np.zeros((cells, 3)),
+            "body_orientation": np.zeros((cells, 4)),
+            "body_angle": np.zeros(cells),
+            "motor_angle": np.zeros(self._first_flagellum[-1]),
         }
-    duration = now.time[cells] - before.time[cells]
-    at_ends = [before.body_position[cells], now.body_position[cells]]
-    at_ends += [before.body_orientation[cells], now.body_orientation[cells]]
-    return measured | {
-        "body_speed": body_speeds(duration, *at_ends),
-        "body_rate": (now.body_angle[cells] - before.body_angle[cells]) / (2 * np.pi * duration),
-        "motor_rate": (now.motor_angle[flagella] - before.motor_angle[flagella]) / (2 * np.pi * duration[:, None]),
-    }
+
+    def take_from(self, stepper: Stepper) -> None:
+        """Has the stepper take frames from inside its steps, from the next pass that is captured on."""
+        self._end_steps = stepper.ends_at_frames
+        stepper.dense = self._dense = frame_slots.allocate(self._system.model, self._system.state)
+
+    @property
+    def taken(self) -> bool:
+        """Whether the stepper takes frames."""
+        return self._dense is not None
+
+    def memory(self) -> dict[str, np.ndarray]:
+        """What the next frames need to come out with the same bits: of the last frame, and of the last step."""
+        kept = {"index": self.index.copy(), **{name: values.copy() for name, values in self.last.items()}}
+        before = self._dense.memory() if self._dense is not None else {}
+        return kept | {f"before_{name}": array.numpy().copy() for name, array in before.items()}
+
+    def recall(self, memory: Mapping[str, np.ndarray]) -> None:
+        """Takes back what `memory` gave.
+
+        Raises:
+            KeyError: something is missing.
+            ValueError: the shapes are of other cells.
+        """
+        self.index[:] = memory["index"]
+        for name, values in self.last.items():
+            values[...] = memory[name]
+        if self._dense is not None:
+            for name, array in self._dense.memory().items():
+                array.assign(memory[f"before_{name}"])
+
+    def pass_by(self, times: np.ndarray) -> None:
+        """Frames up to these times [s] are behind the cells, although nobody wanted them."""
+        begun = self.index >= 0
+        behind = np.floor(times / self._durations * self._counts + _ROUNDING).astype(np.int64)
+        self.index = np.where(begun, np.maximum(self.index, behind), -1)
+
+    def first(self, now: Cells) -> list[dict[int, Frame]]:
+        """The first frame of every cell, at its present time; rates, differences between two frames, are NaN."""
+        self.index[:] = 0
+        self.pass_by(now.time)
+        names = ("time", "step", "positions", "directors", "motor_angle", "body_angle", "body_position")
+        arrays = {name: getattr(now, name)[None] for name in (*names, "body_orientation", "elastic_energy")}
+        before = {name: np.full_like(arrays[name], np.nan) for name in _MOTION}
+        counts = np.ones(len(now.time), dtype=np.int64)
+        block = _Block(counts=counts, steric_force=now.steric_force[None], before=before, **arrays)
+        return self._measured(block)
+
+    def schedule(self, until: float | None, waiting: np.ndarray) -> bool:
+        """Tells the device the times of the next frames; returns whether there are any.
+
+        Args:
+            until: time that no frame is beyond [s]; None: the end of each scene.
+            waiting: cells that go on, shape [cell_count].
+        """
+        assert self._dense is not None
+        dense, slots = self._dense.data, self._dense.slots
+        most = 1 if self._end_steps else slots
+        ends = self._durations if until is None else until
+        last = np.floor(ends / self._durations * self._counts + _ROUNDING).astype(np.int64)
+        counts = np.where(waiting, np.clip(last - self.index, 0, most), 0)
+        numbers = self.index[:, None] + 1 + np.arange(slots)
+        self._wanted = self._durations[:, None] * numbers / self._counts[:, None]
+        self._ends = self._durations * last / self._counts
+        dense.time.assign(self._wanted.ravel())
+        dense.count.assign(counts.astype(np.int32))
+        dense.taken.zero_()
+        self._scheduled = counts
+        return bool(counts.any())
+
+    def targets(self, until: float | None) -> np.ndarray:
+        """Where steps of each cell end [s]: at `until`, at frames only if the stepper has to, shape [cell_count]."""
+        if self._end_steps:
+            return np.where(self._scheduled > 0, self._wanted[:, 0], 0.0)
+        beyond = np.full(len(self._ends), _NEVER) if until is None else np.maximum(self._ends, until)
+        return np.where(self._scheduled > 0, beyond, 0.0)
+
+    def take_rest(self, times: np.ndarray) -> bool:
+        """Takes the frames that fall into the last steps and found no slot before; returns whether there were any."""
+        assert self._dense is not None
+        if not ((self._scheduled > 0) & (self._wanted[:, 0] <= times)).any():
+            return False
+        dense_output.take_rest(self._system.model, self._system.control, self._dense)
+        return True
+
+    def collect(self) -> list[dict[int, Frame]]:
+        """The frames in the slots: the next one of each cell that has one, by cell, and so on."""
+        assert self._dense is not None
+        d, model = self._dense.data, self._system.model
+        counts = d.taken.numpy().astype(np.int64)
+        m, cells, elements = int(counts.max()), model.cell_count, model.element_count
+        if m == 0:
+            return []
+
+        def read(array: Any, each: int) -> np.ndarray:
+            return array[: m * each].numpy().reshape(m, each, *array.numpy().shape[1:])
+
+        centres = read(d.body_position, cells).copy()
+        arrays = {
+            "time": self._wanted[:, :m].T,
+            "body_position": centres,
+            "body_orientation": read(d.body_orientation, cells).copy(),
+            "body_angle": read(d.body_angle, cells).copy(),
+            "motor_angle": read(d.motor_angle, model.flagellum_count).copy(),
+        }
+        before = {name: np.concatenate([self.last[name][None], arrays[name][:-1]]) for name in _MOTION}
+        steric = np.zeros((m, cells))
+        if model.switches.has("steric"):
+            steric = 0.5 * self._sums(read(d.steric, elements))
+        block = _Block(
+            counts=counts,
+            step=read(d.step, cells).copy(),
+            positions=read(d.position, elements).astype(np.float64) + centres[:, self._cell_of_node],
+            directors=read(d.director, elements).astype(np.float64),
+            elastic_energy=self._sums(read(d.energy, elements)),
+            steric_force=steric,
+            before=before,
+            **arrays,
+        )
+        self.index += counts
+        return self._measured(block)
+
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        """The sum over the nodes of each cell, shape [m, cell_count, ...]; independent of other cells to the bit."""
+        return np.add.reduceat(values.astype(np.float64), self._first_node_of_cell, axis=1)
+
+    def _flagella(self, cell: int) -> slice:
+        return slice(int(self._first_flagellum[cell]), int(self._first_flagellum[cell + 1]))
+
+    def _measured(self, block: _Block) -> list[dict[int, Frame]]:
+        """Observables of all frames of cells of one structure at once."""
+        found: list[dict[int, Frame]] = [{} for _ in range(int(block.counts.max()))]
+        for group in self._by_structure(block.counts):
+            m = np.concatenate([np.arange(block.counts[c]) for c in group])
+            cells = np.repeat(group, block.counts[group])
+            measured = self._observables(block, m, cells)
+            for row, (i, c) in enumerate(zip(m.tolist(), cells.tolist(), strict=True)):
+                observables = {name: values[row] for name, values in measured.items()}
+                observables["steric_force_density"] = block.steric_force[i, c] / self._lengths[c]
+                flagella = self._flagella(c)
+                nodes = slice(int(self._first_node[flagella.start]), int(self._first_node[flagella.stop]))
+                found[i][c] = Frame(
+                    time=float(block.time[i, c]),
+                    step=int(block.step[i, c]),
+                    positions=block.positions[i, nodes],
+                    directors=block.directors[i, nodes],
+                    motor_angle=block.motor_angle[i, flagella],
+                    body_position=block.body_position[i, c],
+                    body_orientation=block.body_orientation[i, c],
+                    observables=observables,
+                )
+        for c in np.flatnonzero(block.counts).tolist():
+            at, flagella = block.counts[c] - 1, self._flagella(c)
+            for name in _MOTION:
+                own = flagella if name == "motor_angle" else c
+                self.last[name][own] = getattr(block, name)[at, own]
+        return found
+
+    def _by_structure(self, counts: np.ndarray) -> list[list[int]]:
+        """Cells that have frames, in groups whose flagella have the same numbers of nodes."""
+        groups: dict[tuple[int, ...], list[int]] = {}
+        for c in np.flatnonzero(counts):
+            own = self._flagella(int(c))
+            groups.setdefault(tuple(np.diff(self._first_node[own.start : own.stop + 1])), []).append(int(c))
+        return list(groups.values())
+
+    def _observables(self, block: _Block, m: np.ndarray, cells: np.ndarray) -> dict[str, np.ndarray]:
+        """Observables of frames m of cells of one structure, by name, shape [row] or [row, flagellum_count]."""
+        own = self._flagella(int(cells[0]))
+        first_node = self._first_node[own.start : own.stop + 1] - self._first_node[own.start]
+        flagella = self._first_flagellum[cells][:, None] + np.arange(len(first_node) - 1)
+        nodes = self._first_node_of_cell[cells][:, None] + np.arange(first_node[-1])
+        row = m[:, None]
+        positions = block.positions[row, nodes]
+        measured: dict[str, np.ndarray] = {}
+        if len(first_node) > 2:
+            measured["phase_difference"] = phase_differences(positions, block.directors[row, nodes], first_node)
+        measured["bundle_length"] = bundle_lengths(positions, first_node)
+        measured["elastic_energy"] = block.elastic_energy[m, cells].sum(axis=1)
+        before = block.before
+        duration = block.time[m, cells] - before["time"][m, cells]
+        at_ends = [before["body_position"][m, cells], block.body_position[m, cells]]
+        at_ends += [before["body_orientation"][m, cells], block.body_orientation[m, cells]]
+        turned = block.body_angle[m, cells] - before["body_angle"][m, cells]
+        motors_turned = block.motor_angle[row, flagella] - before["motor_angle"][row, flagella]
+        return measured | {
+            "body_speed": body_speeds(duration, *at_ends),
+            "body_rate": turned / (2 * np.pi * duration),
+            "motor_rate": motors_turned / (2 * np.pi * duration[:, None]),
+        }

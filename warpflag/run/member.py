@@ -31,7 +31,8 @@ __all__ = ["Member", "Outcome"]
 # HDF5 leaves a file that can't be opened when a write of its own fails, so the disk is looked at before: room for a
 # chunk of frames, twice, and for checkpoint and summary.
 _LEAST_ROOM = 1 << 18
-_FRAMES_OF_ROOM = 128
+_FRAMES_OF_ROOM = 160
+_FRAMES_PER_COMMIT = 64
 
 
 @dataclass(frozen=True)
@@ -68,11 +69,12 @@ class Member:
         self.directory, self.scene = directory, scene
         self.outcome: Outcome | None = None
         self._lock = lock
-        self._saved_time = resumed["time"] if resumed else -1.0
+        self._saved_step = resumed["step"] if resumed else -1
         self._began = monotonic() - (resumed["wall_time"] if resumed else 0.0)
-        buffered = {} if alone else {"block_frames": 64, "keep_open": False}
         step = resumed["step"] if resumed else None
-        self.recorder = Recorder(directory / RECORD_NAME, resume_step=step, **buffered)
+        self.recorder = Recorder(
+            directory / RECORD_NAME, resume_step=step, block_frames=_FRAMES_PER_COMMIT, keep_open=alone
+        )
 
     @property
     def wall_time(self) -> float:
@@ -96,14 +98,14 @@ class Member:
         return self.recorder.frame_count == self.scene.frames + 1
 
     def save(self, arrays: Mapping[str, np.ndarray], device: str) -> None:
-        """Writes a checkpoint, the frames before it first; the one of the last checkpoint's time is there already.
+        """Writes a checkpoint, the frames before it first; the one of the last checkpoint's step is there already.
 
         Args:
-            arrays: the checkpoint of the cell at one of its recorded frames.
+            arrays: the checkpoint of the cell when all frames up to its time were recorded.
             device: that it was computed on.
         """
-        step, time = int(arrays["control.steps"][0]), float(arrays["control.time"][0])
-        if time == self._saved_time:
+        step, time = int(arrays["control.steps"][0]), float(arrays["frame.time"][0])
+        if step == self._saved_step:
             return
         meta = {
             "step": step,
@@ -116,7 +118,7 @@ class Member:
         self.recorder.flush()
         sync(self.recorder.path)
         checkpoint.save(self.directory, arrays, meta)
-        self._saved_time = time
+        self._saved_step = step
 
     def finish(
         self,

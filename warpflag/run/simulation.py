@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -19,13 +19,12 @@ from warpflag.base.device import LAUNCHING, alone, find_device
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import check_outside
-from warpflag.model.terms import supplied_power
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, start_reporter
-from warpflag.run.cells import Cells, CellsReader
+from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError
-from warpflag.run.frames import frames_of
+from warpflag.run.frames import Frames
 from warpflag.run.starts import starting_states
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
@@ -33,7 +32,7 @@ from warpflag.stepping import System, make_stepper
 __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
 _SECONDS_PER_REPLAY = 0.2
-_ROUNDING = 1e-6  # of a frame interval: times this close are the same
+_SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
 # Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
 _KEPT_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
 _KEPT_CHART = ("flagellum_spin", "motor_angle", "body_angle")
@@ -86,12 +85,12 @@ class Simulation:
         self.first_node = model.data.first_node.numpy()
         self._first_flagellum = model.data.first_flagellum.numpy()
         self.reporters = list(reporters)
-        self._framed: Cells | None = None
         self._capture, self._graph = capture, None
         self._checked = False
         self._passes_per_replay = 200
         self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
         self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
+        self._frames = Frames(self.system, self.scenes)
         self._reader = CellsReader(self.system, self._energy, self._steric)
         self._excluded = np.zeros(len(self.scenes), dtype=bool)
 
@@ -160,53 +159,79 @@ class Simulation:
     def cell_frames(
         self, until: float | None = None, watch: Callable[[], None] | None = None
     ) -> Iterator[dict[int, Frame]]:
-        """Advances every cell from frame to frame, each at multiples of its own scene's duration / frames.
+        """The frames of `frame_blocks` one after the other: the next frame of each cell that has one, by cell."""
+        for block in self.frame_blocks(until, watch):
+            yield from block
 
-        A cell that violates a guard, and one that was excluded, has no further frames; the others go on.
+    def frame_blocks(
+        self, until: float | None = None, watch: Callable[[], None] | None = None
+    ) -> Iterator[list[dict[int, Frame]]]:
+        """Advances every cell, and yields frames of each at multiples of its own scene's duration / frames.
+
+        Frames are taken inside steps and handed over in blocks, so cells are ahead of them: after a block, up to the
+        end of the step into which its last frame falls, or of one of the next. Only `until` ends steps. A cell that
+        violates a guard, and one that was excluded, has no further frames; the others go on.
 
         Args:
-            until: simulated time that no frame is beyond [s]; default: the end of each scene.
+            until: simulated time that no frame is beyond [s]; default: the end of each scene, which steps may pass.
             watch: as in `advance`.
 
         Returns:
-            An iterator over the next frame of each cell that has one, by cell.
+            An iterator over blocks: the next frame of each cell that has one, by cell; then those after them; and so
+            on. A block may be empty, since the host also looks a few times a second.
         """
-        durations, counts = (
-            np.array([getattr(scene, name) for scene in self.scenes]) for name in ("duration", "frames")
-        )
-        lengths = [float(np.mean([spec.length for spec in scene.resolved_flagella()])) for scene in self.scenes]
-        if self._framed is None:
-            self._framed = self._present_state()
-            yield frames_of(self._framed, None, lengths, range(len(self.scenes)))
-        last = np.floor((durations if until is None else until) / durations * counts + _ROUNDING)
-        while True:
-            k = np.floor(self.times / durations * counts + _ROUNDING)
-            waiting = (k < last) & ~self._excluded & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
-            if not waiting.any():
-                return
-            self._advance(np.where(waiting, durations * (k + 1) / counts, 0.0), watch)
-            before, self._framed = self._framed, self.cells()
-            reached = waiting & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
-            yield frames_of(self._framed, before, lengths, np.flatnonzero(reached))
+        if (self._frames.index < 0).all():
+            yield self._frames.first(self._present_state())
+        self.prepare(recording=True)
+        while self._schedule(until):
+            self._advance(self._frames.targets(until), watch, _SECONDS_PER_BLOCK)
+            yield self._collect(until)
+
+    @alone
+    def _schedule(self, until: float | None) -> bool:
+        """Asks for the next frames of cells that no guard has stopped and nobody has excluded; whether there are any."""
+        sound = self.system.control.fault.numpy() == control_stage.NO_FAULT
+        return self._frames.schedule(until, sound & ~self._excluded)
+
+    @alone
+    def _collect(self, until: float | None) -> list[dict[int, Frame]]:
+        """All frames up to the times that the cells have reached."""
+        block = self._frames.collect()
+        while self._schedule(until) and self._frames.take_rest(self.times):
+            block += self._frames.collect()
+        return block
 
     def exclude(self, cell: int) -> None:
-        """Advances a cell no further: `cell_frames` goes on with the others."""
+        """Advances a cell no further: `frame_blocks` goes on with the others."""
         self._excluded[cell] = True
 
     @alone
-    def prepare(self) -> None:
-        """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does."""
+    def prepare(self, recording: bool = False) -> None:
+        """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does.
+
+        Args:
+            recording: frames will be taken.
+        """
         if not self._checked:
             self._check_start()
+        if recording and not self._frames.taken:
+            self._take_frames()
         if not self._capture or self._graph is not None:
             return
         # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
         # changes nothing.
         self.system.control.between_steps.fill_(1)
+        if self.stepper.dense is not None:
+            self.stepper.dense.data.any_due.fill_(1)
         self.stepper.launch_pass()
         with wp.ScopedCapture(device=self.device) as captured:
             wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
         self._graph = captured.graph
+
+    def _take_frames(self) -> None:
+        """Has the stepper take frames; a pass that was captured without is captured anew."""
+        self._frames.take_from(self.stepper)
+        self._graph = None
 
     def advance(self, until: float, watch: Callable[[], None] | None = None) -> None:
         """Advances every cell to one time.
@@ -219,17 +244,23 @@ class Simulation:
             NumericalError: a guard was violated; the device holds the offending state, frames taken before are sound.
         """
         self._advance(np.full(len(self.scenes), float(until)), watch)
+        self._frames.pass_by(self.times)
         self._raise_fault()
 
-    def _advance(self, until: np.ndarray, watch: Callable[[], None] | None = None) -> None:
-        """Advances every sound cell to its own time [s], shape [cell_count]; past times leave a cell where it is."""
+    def _advance(self, until: np.ndarray, watch: Callable[[], None] | None = None, seconds: float = math.inf) -> None:
+        """Advances every sound cell to its own time [s], shape [cell_count]; past times leave a cell where it is.
+
+        After so many seconds of wall time cells rest at the ends of their steps.
+        """
         control, state = self.system.control, self.system.state.data
         self.prepare()
         waiting = (self.times < until) & (control.fault.numpy() == control_stage.NO_FAULT)
         with LAUNCHING:
             control.target.assign(until)
             state.active.assign(waiting.astype(np.int32))
+            control.rest.zero_()
             control.unfinished.fill_(int(waiting.sum()))
+        began = clock.perf_counter()
         while control.unfinished.numpy()[0] > 0:
             with LAUNCHING:
                 control.budget.fill_(self._passes_per_replay)
@@ -240,6 +271,9 @@ class Simulation:
             if done:  # a full replay: aim at a fixed wall time between two looks from the host
                 per_pass = (clock.perf_counter() - started) / self._passes_per_replay
                 self._passes_per_replay = int(np.clip(_SECONDS_PER_REPLAY / per_pass, 20, 1_000_000))
+            if clock.perf_counter() - began > seconds:
+                with LAUNCHING:
+                    control.rest.fill_(1)
             if watch is not None:
                 watch()
 
@@ -273,6 +307,7 @@ class Simulation:
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
         own = {name: array.numpy().copy() for name, array in self._carried().items()}
+        own |= {f"frame.{name}": values for name, values in self._frames.memory().items()}
         return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
 
     @alone
@@ -283,18 +318,28 @@ class Simulation:
             ValueError: the arrays are of another simulation.
         """
         carried = self._carried()
-        memory = {name.partition(".")[2]: values for name, values in arrays.items() if name.startswith("stepper.")}
-        if carried.keys() != arrays.keys() - {f"stepper.{name}" for name in memory}:
+        parts: dict[str, dict[str, np.ndarray]] = {"stepper": {}, "frame": {}}
+        for name, values in arrays.items():
+            part, _, own = name.partition(".")
+            if part in parts:
+                parts[part][own] = values
+        if "before_position" in parts["frame"] and not self._frames.taken:
+            self._take_frames()
+        if len(carried) + len(parts["stepper"]) + len(parts["frame"]) != len(arrays):
             raise ValueError("the checkpoint is of another version or another stepper")
-        if memory.keys() != self.stepper.memory().keys():
+        if parts["stepper"].keys() != self.stepper.memory().keys():
             raise ValueError("the checkpoint is of another stepper")
+        if parts["frame"].keys() != self._frames.memory().keys():
+            raise ValueError("the checkpoint is of another version")
         for name, array in carried.items():
             if array.numpy().shape != arrays[name].shape:
                 raise ValueError(f"the checkpoint is of other cells: {name} has the shape {arrays[name].shape}")
             array.assign(arrays[name])
         self.stepper.restart()
-        self.stepper.recall(memory)
-        self._framed = self._present_state()
+        self.stepper.recall(parts["stepper"])
+        self._frames.recall(parts["frame"])
+        self._reconstruct()
+        self.system.state.data.active.zero_()
 
     def part(self, arrays: Mapping[str, np.ndarray], cell: int) -> dict[str, np.ndarray]:
         """The part of a checkpoint that belongs to one cell: the checkpoint of that cell alone."""
@@ -320,27 +365,7 @@ class Simulation:
         self._reconstruct()
         launch_right_hand_side(model, s)
         s.data.active.zero_()
-        flagella, nodes = self._own(cell)
-
-        def host(array: Any, part: Any) -> np.ndarray:
-            return array.numpy()[part].astype(np.float64)
-
-        torques = host(s.data.spin_torque, nodes)
-        mobility = np.repeat(model.data.drag.spin_mobility.numpy(), np.diff(self.first_node))[nodes]
-        found = Evaluation(
-            forces=host(s.data.force, nodes),
-            torques=torques,
-            velocities=host(s.data.velocity, nodes),
-            spins=mobility * torques,
-            tangents=host(s.data.pose.tangent, nodes),
-            first=self.first_node[flagella] - nodes.start,
-            supplied={},
-            body_force=host(s.data.flagellum_force, flagella).sum(axis=0),
-            body_torque=host(s.data.flagellum_torque, flagella).sum(axis=0),
-            body_velocity=host(s.data.body_velocity, cell),
-            body_spin=host(s.data.body_spin, cell),
-        )
-        return dataclasses.replace(found, supplied=supplied_power(self.scenes[cell], found))
+        return evaluation_of(self.system, self.scenes[cell], *self._own(cell))
 
     def _own(self, cell: int) -> tuple[slice, slice]:
         """The flagella and the nodes of one cell."""

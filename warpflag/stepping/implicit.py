@@ -25,7 +25,8 @@ from warpflag_kernels.implicit import (
     step_flow,
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian
-from warpflag_kernels.stepping import health, step_control
+from warpflag_kernels.stepping import dense_output, health, step_control
+from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 from warpflag.scene import Scene
 from warpflag.stepping.stepper import DEFAULT_ACCURACY, STEP_MEMORY, System, restart_step_control
@@ -127,6 +128,8 @@ class ImplicitStepper:
             self._krylov = krylov.allocate(model)
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
+        self.dense: DenseOutput | None = None
+        self.ends_at_frames = False
         self.restart()
 
     def launch_pass(self) -> None:
@@ -167,6 +170,8 @@ class ImplicitStepper:
         health.check(model, state, s.chart, s.guard, s.control, self.contacts if self._touching else None)
         inputs = [model.data, state.data, band, self.contacts, self.law, s.chart, s.control, self.steps, i]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
+        if self.dense is not None:
+            dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
         inputs = [model.data, state.data, i, moved.last, moved.before, last, before]
         wp.launch(k.keep_elements, model.element_count, inputs=inputs, device=device)
         comoving_chart.commit(model, state, s.chart)

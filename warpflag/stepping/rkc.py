@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.rod import comoving_chart, reconstruction
-from warpflag_kernels.stepping import health, rkc, step_control
+from warpflag_kernels.stepping import dense_output, health, rkc, step_control
+from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.scene import Scene
@@ -57,6 +58,8 @@ class RkcStepper:
         system.control.longest_step.assign(longest)
         system.guard.interval.fill_(EULER_STEPS_PER_CHECK if euler else 1)
         self._controlled = any(accuracies)
+        self.dense: DenseOutput | None = None
+        self.ends_at_frames = euler  # which is checked at targets, and not after every step
         self._seed_probe()
         self.restart()
 
@@ -77,6 +80,8 @@ class RkcStepper:
         if not self._euler and self._controlled:
             comoving_chart.increment_rates(s.model, s.state, s.chart)
             rkc.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
+        if self.dense is not None:
+            dense_output.take(s.model, s.state, s.chart, s.control, self.dense, counted=False)
         comoving_chart.commit(s.model, s.state, s.chart)
         health.remember(s.model, s.state, s.chart, s.guard, s.control)
         if not self._euler:

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from warpflag_kernels.base.types import DeviceModel, DeviceState
+from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 __all__ = ["DEFAULT_ACCURACY", "STEP_MEMORY", "Stepper", "System", "restart_step_control"]
 
@@ -41,6 +42,12 @@ STEP_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")
 
 class Stepper(Protocol):
     """Advances every active cell toward its target; all its decisions are taken on the device."""
+
+    dense: DenseOutput | None
+    """Where frames go that fall into steps; None: nowhere. Set before a pass is captured."""
+
+    ends_at_frames: bool
+    """Whether a step ends at the time of every frame; if not, frames are taken from inside steps."""
 
     def launch_pass(self) -> None:
         """Launches one pass of the loop; captured once and replayed."""

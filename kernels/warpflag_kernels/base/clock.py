@@ -25,6 +25,7 @@ class Control:
     longest_step: wp.array(dtype=wp.float64)  # [s]
     step: wp.array(dtype=wp.float64)  # the current one [s]
     steps: wp.array(dtype=wp.int32)  # taken so far
+    rest: wp.array(dtype=wp.int32)  # 1: at the end of this step the cell rests until the next advance
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
     between_steps: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass
@@ -52,7 +53,7 @@ def allocate(cell_count: int, device: Any) -> Control:
     """Clocks at time zero, no cell at work."""
     c = Control()
     c.time, c.target, c.longest_step, c.step = (wp.zeros(cell_count, dtype=wp.float64, device=device) for _ in range(4))
-    c.steps = wp.zeros(cell_count, dtype=wp.int32, device=device)
+    c.steps, c.rest = (wp.zeros(cell_count, dtype=wp.int32, device=device) for _ in range(2))
     c.fault = wp.full(cell_count, NO_FAULT, dtype=wp.int32, device=device)
     c.unfinished, c.between_steps, c.budget, c.proceed = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4))
     return c

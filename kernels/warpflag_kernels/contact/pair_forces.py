@@ -215,6 +215,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         magnitude_out: wp.array(dtype=real),
     ):
         e = wp.tid()
+        if state.active[model.cell_of[e]] == 0:
+            return
         total = real(0.0)
         if e > model.first_node[model.flagellum_of[e]]:
             _first, _second, total = pairs_of(model, state, near, e)
@@ -250,7 +252,8 @@ def body_contact(model: DeviceModel, state: DeviceState) -> None:
 
 
 def steric_magnitudes(model: DeviceModel, state: DeviceState, magnitude_out: wp.array) -> None:
-    """Sum of |F| over the pairs of each segment [pN], shape [element_count]; every pair counts at both sides."""
+    """Sum of |F| over the pairs of each segment of active cells [pN], shape [element_count]; every pair counts at both
+    sides."""
     neighbours.refresh(model, state)
     inputs = [model.data, state.data, state.neighbours, magnitude_out]
     wp.launch(_kernels(model.precision).magnitudes, model.element_count, inputs=inputs, device=model.device)

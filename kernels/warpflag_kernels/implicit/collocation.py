@@ -367,7 +367,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         if imp.accepted[c] != 0:
             last.body[c] = next_last.body[c]
             before.body[c] = next_before.body[c]
-        if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
+        ends = control.time[c] >= control.target[c] or control.fault[c] != no_fault
+        if ends or (control.rest[c] != 0 and imp.accepted[c] != 0):
             state.active[c] = 0
             wp.atomic_sub(control.unfinished, 0, 1)
 

@@ -113,9 +113,32 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
+def turns(p: Precision) -> SimpleNamespace:
+    """Device functions: how far a motor and a body have turned from one pose to another."""
+    Model, Pose, vec3 = structs(p).Model, structs(p).Pose, p.vec3
+    module = p.module("turns")
+
+    @wp.func(module=module)
+    def motor_turn(model: Model, start: Pose, end: Pose, e: wp.int32, k: wp.int32, c: wp.int32):
+        """Turn of the tripod e of motor k between two poses, seen from the body [rad]."""
+        old = wp.quat_rotate_inv(start.body_orientation[c], wp.vec3d(start.director[e]))
+        new = wp.quat_rotate_inv(end.body_orientation[c], wp.vec3d(end.director[e]))
+        axis = wp.vec3d(model.motor.axis[k])
+        return wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
+
+    @wp.func(module=module)
+    def body_turn(increment: vec6d, axis: vec3):
+        """Turn of a body about its axis in an increment [rad]."""
+        return wp.dot(wp.vec3d(increment[3], increment[4], increment[5]), wp.vec3d(axis))
+
+    return SimpleNamespace(motor_turn=motor_turn, body_turn=body_turn)
+
+
+@functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3, mat33 = p.real, p.vec3, p.mat33
     Model, State, Chart = structs(p).Model, structs(p).State, struct(p)
+    motor_turn, body_turn = turns(p).motor_turn, turns(p).body_turn
     find_rate, find_body_rate = functions(p).find_rate, functions(p).find_body_rate
     module = p.module("chart")
 
@@ -135,11 +158,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         k = model.flagellum_of[e]
         director = state.pose.director[e]
         if e == model.first_node[k]:
-            # The motor's turn in this step, seen from the body.
-            old = wp.quat_rotate_inv(chart.base.body_orientation[c], wp.vec3d(chart.base.director[e]))
-            new = wp.quat_rotate_inv(state.pose.body_orientation[c], wp.vec3d(director))
-            axis = wp.vec3d(model.motor.axis[k])
-            chart.motor_angle[k] += wp.atan2(wp.dot(axis, wp.cross(old, new)), wp.dot(old, new))
+            chart.motor_angle[k] += motor_turn(model, chart.base, state.pose, e, k, c)
         chart.base.position[e] = state.pose.position[e]
         chart.base.tangent[e] = state.pose.tangent[e]
         chart.base.director[e] = director
@@ -156,8 +175,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = wp.tid()
         if state.active[c] == 0 or chart.commit[c] == 0:
             return
-        b = chart.body_increment[c]
-        chart.body_angle[c] += wp.dot(wp.vec3d(b[3], b[4], b[5]), wp.vec3d(state.pose.body_axis[c]))
+        chart.body_angle[c] += body_turn(chart.body_increment[c], state.pose.body_axis[c])
         chart.base.body_position[c] = state.pose.body_position[c]
         chart.base.body_orientation[c] = state.pose.body_orientation[c]
         chart.body_increment[c] = vec6d(wp.float64(0.0))

@@ -174,6 +174,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         energy_out: wp.array(dtype=vec3),
     ):
         e = wp.tid()
+        if state.active[model.cell_of[e]] == 0:
+            return
         k = model.flagellum_of[e]
         first = model.first_node[k]
         h = model.rod.segment_length[k]
@@ -206,7 +208,7 @@ def joint_gradients(model: DeviceModel, state: DeviceState) -> None:
 
 
 def elastic_energy(model: DeviceModel, state: DeviceState, energy_out: wp.array) -> None:
-    """Bending, twist and stretching energy per element [pN um], shape [element_count, 3]."""
+    """Bending, twist and stretching energy per element of active cells [pN um], shape [element_count, 3]."""
     kernel = _kernels(model.precision).energy
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data, energy_out], device=model.device)
 

@@ -103,6 +103,29 @@ def functions(p: Precision) -> SimpleNamespace:
         return quat(w[0] * scale, w[1] * scale, w[2] * scale, c)
 
     @wp.func(module=module)
+    def rotation_vector(sine: vec3, cosine: real):
+        """Rotation vector, from its direction times the sine of its angle, and the cosine [rad]."""
+        s = wp.length(sine)
+        scale = real(1.0)
+        if s > real(1.0e-8):
+            scale = wp.atan2(s, cosine) / s
+        return scale * sine
+
+    @wp.func(module=module)
+    def triad_rotation(t: vec3, a: vec3, u: vec3, b: vec3):
+        """Rotation vector that takes the triad of tangent t and director a onto that of u and b, below pi [rad]."""
+        ta = wp.cross(t, a)
+        ub = wp.cross(u, b)
+        sine = real(0.5) * (wp.cross(t, u) + wp.cross(a, b) + wp.cross(ta, ub))
+        return rotation_vector(sine, real(0.5) * (wp.dot(t, u) + wp.dot(a, b) + wp.dot(ta, ub) - real(1.0)))
+
+    @wp.func(module=module)
+    def quat_rotation_vector(q: quat):
+        """Rotation vector of a unit quaternion, below pi [rad]."""
+        half = real(2.0) * q[3]
+        return rotation_vector(half * vec3(q[0], q[1], q[2]), half * q[3] - real(1.0))
+
+    @wp.func(module=module)
     def attached(orientation: wp.quatd, v: vec3):
         """A vector that stands still in body axes, in lab axes."""
         return vec3(wp.quat_rotate(orientation, wp.vec3d(v)))
@@ -122,6 +145,8 @@ def functions(p: Precision) -> SimpleNamespace:
         twist_angle=twist_angle,
         joint_strain=joint_strain,
         rotation_vector_quat=rotation_vector_quat,
+        triad_rotation=triad_rotation,
+        quat_rotation_vector=quat_rotation_vector,
         attached=attached,
         body_axis=body_axis,
     )

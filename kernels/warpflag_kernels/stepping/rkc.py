@@ -337,7 +337,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             if chart.commit[c] != 0:
                 control.steps[c] += 1
                 control.time[c] = advanced(control, c)
-            if control.time[c] >= control.target[c] or control.fault[c] != no_fault:
+            ends = control.time[c] >= control.target[c] or control.fault[c] != no_fault
+            if ends or control.rest[c] != 0:
                 state.active[c] = 0
                 wp.atomic_sub(control.unfinished, 0, 1)
             rkc.stage[c] = wp.static(1 if euler else 0)
