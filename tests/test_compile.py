@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 import warpflag_kernels
 from warpflag_kernels.base.plan import CONTACT_BLOCK
+from warpflag_kernels.stepping import dense_output
 
 from tests.helpers import cell
 from tests.plans import as_on_gpu, plan
@@ -67,13 +68,16 @@ def launched(
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
         own = plan(scene, "cpu")
-        sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own, CONTACT_BLOCK))
+        sim = Simulation(scene, plan=own if by_cells else as_on_gpu(own, CONTACT_BLOCK), capture=False)
         sim.system.control.between_steps.fill_(1)  # a pass between two steps has every kernel
         if stepper == "implicit" and sim.stepper.stability is not None:
             sim.stepper.stability.due.fill_(1)
         patch.setattr(wp, "launch", lambda kernel, *_args, **_options: kernels.add(kernel))
         patch.setattr(wp, "launch_tiled", lambda kernel, *_args, **_options: kernels.add(kernel))
+        patch.setattr(wp, "capture_while", lambda _condition, body, **arguments: body(**arguments))
+        sim.prepare(recording=True)
         sim.stepper.launch_pass()
+        dense_output.take_rest(sim.system.model, sim.system.control, sim.stepper.dense)
         sim.evaluate()
         sim.cell_state()
     return kernels

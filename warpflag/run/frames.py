@@ -159,16 +159,22 @@ class Frames:
         beyond = np.full(len(self._ends), _NEVER) if until is None else np.maximum(self._ends, until)
         return np.where(self._scheduled > 0, beyond, 0.0)
 
-    def take_rest(self, times: np.ndarray) -> bool:
-        """Takes the frames that fall into the last steps and found no slot before; returns whether there were any."""
-        assert self._dense is not None
-        if not ((self._scheduled > 0) & (self._wanted[:, 0] <= times)).any():
-            return False
-        dense_output.take_rest(self._system.model, self._system.control, self._dense)
-        return True
+    def collect(self, until: float | None, waiting: np.ndarray, times: np.ndarray) -> list[dict[int, Frame]]:
+        """All frames up to the times that the cells have reached: the next one of each cell, by cell, and so on.
 
-    def collect(self) -> list[dict[int, Frame]]:
-        """The frames in the slots: the next one of each cell that has one, by cell, and so on."""
+        Args:
+            until, waiting: as in `schedule`.
+            times: that the cells have reached [s].
+        """
+        assert self._dense is not None
+        found = self._in_slots()
+        # Those that fall into the last steps and found no slot before.
+        while self.schedule(until, waiting) and ((self._scheduled > 0) & (self._wanted[:, 0] <= times)).any():
+            dense_output.take_rest(self._system.model, self._system.control, self._dense)
+            found += self._in_slots()
+        return found
+
+    def _in_slots(self) -> list[dict[int, Frame]]:
         assert self._dense is not None
         d, model = self._dense.data, self._system.model
         counts = d.taken.numpy().astype(np.int64)

@@ -187,19 +187,17 @@ class Simulation:
             self._advance(self._frames.targets(until), watch, _SECONDS_PER_BLOCK)
             yield self._collect(until)
 
+    def _going_on(self) -> np.ndarray:
+        """Cells that no guard has stopped and nobody has excluded, shape [cell_count]."""
+        return ~self._excluded & (self.system.control.fault.numpy() == control_stage.NO_FAULT)
+
     @alone
     def _schedule(self, until: float | None) -> bool:
-        """Asks for the next frames of cells that no guard has stopped and nobody has excluded; whether there are any."""
-        sound = self.system.control.fault.numpy() == control_stage.NO_FAULT
-        return self._frames.schedule(until, sound & ~self._excluded)
+        return self._frames.schedule(until, self._going_on())
 
     @alone
     def _collect(self, until: float | None) -> list[dict[int, Frame]]:
-        """All frames up to the times that the cells have reached."""
-        block = self._frames.collect()
-        while self._schedule(until) and self._frames.take_rest(self.times):
-            block += self._frames.collect()
-        return block
+        return self._frames.collect(until, self._going_on(), self.times)
 
     def exclude(self, cell: int) -> None:
         """Advances a cell no further: `frame_blocks` goes on with the others."""
@@ -318,19 +316,16 @@ class Simulation:
             ValueError: the arrays are of another simulation.
         """
         carried = self._carried()
-        parts: dict[str, dict[str, np.ndarray]] = {"stepper": {}, "frame": {}}
-        for name, values in arrays.items():
-            part, _, own = name.partition(".")
-            if part in parts:
-                parts[part][own] = values
+        parts = {
+            part: {name.partition(".")[2]: x for name, x in arrays.items() if name.startswith(f"{part}.")}
+            for part in ("stepper", "frame")
+        }
         if "before_position" in parts["frame"] and not self._frames.taken:
             self._take_frames()
-        if len(carried) + len(parts["stepper"]) + len(parts["frame"]) != len(arrays):
+        own = {"stepper": self.stepper.memory(), "frame": self._frames.memory()}
+        same = all(parts[part].keys() == own[part].keys() for part in own)
+        if not same or len(carried) + sum(map(len, own.values())) != len(arrays):
             raise ValueError("the checkpoint is of another version or another stepper")
-        if parts["stepper"].keys() != self.stepper.memory().keys():
-            raise ValueError("the checkpoint is of another stepper")
-        if parts["frame"].keys() != self._frames.memory().keys():
-            raise ValueError("the checkpoint is of another version")
         for name, array in carried.items():
             if array.numpy().shape != arrays[name].shape:
                 raise ValueError(f"the checkpoint is of other cells: {name} has the shape {arrays[name].shape}")
