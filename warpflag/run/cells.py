@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import warp as wp
 from warpflag_kernels.contact import pair_forces
 from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import elastic
@@ -85,12 +86,12 @@ class CellsReader:
 
     Args:
         system: what is advanced.
-        energy: scratch array of the elastic energy, shape [node_count, 3].
-        force: scratch array of the contact force, shape [node_count].
     """
 
-    def __init__(self, system: System, energy: Any, force: Any) -> None:
-        self._system, self._energy, self._force = system, energy, force
+    def __init__(self, system: System) -> None:
+        self._system, model = system, system.model
+        self._energy = wp.zeros(model.element_count, dtype=model.precision.vec3, device=model.device)
+        self._force = wp.zeros(model.element_count, dtype=model.precision.real, device=model.device)
         data = system.model.data
         self.first_flagellum, self.first_node = data.first_flagellum.numpy(), data.first_node.numpy()
         self._first_node_of_cell = self.first_node[self.first_flagellum[:-1]]

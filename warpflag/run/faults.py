@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+from warpflag_kernels.base import clock
+from warpflag_kernels.stepping import health
 from warpflag_kernels.stepping.health import Fault
 
-__all__ = ["NumericalError"]
+__all__ = ["NumericalError", "found_faults"]
 
 _ADVICE = {
     Fault.NOT_FINITE: ("a value is not finite", "take a shorter numerics.time_step"),
@@ -51,3 +54,24 @@ class NumericalError(RuntimeError):
         what, advice = _ADVICE[kind]
         where = f"flagellum {flagellum}, segment {segment}"
         super().__init__(f"stopped at {time * 1e3:.6g} ms: {where}: {what}; {advice}")
+
+
+def found_faults(
+    codes: np.ndarray, times: np.ndarray, first_node: np.ndarray, first_flagellum: np.ndarray
+) -> dict[int, NumericalError]:
+    """The violated guard of each cell that was stopped by one, by cell.
+
+    Args:
+        codes: fault of each cell, `NO_FAULT` where sound, shape [cell_count].
+        times: that the cells have reached [s], same shape.
+        first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1.
+        first_flagellum: cell c has the flagella first_flagellum[c] to first_flagellum[c + 1] - 1.
+    """
+    found = {}
+    for cell, code in enumerate(codes):
+        if code != clock.NO_FAULT:
+            kind, element = health.decode(int(code))
+            flagellum = int(np.searchsorted(first_node, element, side="right")) - 1
+            own = flagellum - int(first_flagellum[cell])
+            found[cell] = NumericalError(kind, float(times[cell]), cell, own, element - int(first_node[flagellum]))
+    return found

@@ -23,7 +23,7 @@ from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, start_reporter
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
-from warpflag.run.faults import NumericalError
+from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames
 from warpflag.run.starts import starting_states
 from warpflag.scene import Scene
@@ -77,7 +77,7 @@ class Simulation:
                 check_outside(scene, start)
         self.notes = [start.notes for start in starts]
         model = build_model(self.scenes, plan or plan_of(self.scenes, find_device(device), strict))
-        self.device, precision = model.device, model.precision
+        self.device = model.device
         state = build_state(model)
         chart = build_chart(model, starts)
         self.system = System(model, state, chart, build_control(model, starts), health.allocate(model, chart))
@@ -88,10 +88,8 @@ class Simulation:
         self._capture, self._graph = capture, None
         self._checked = False
         self._passes_per_replay = 200
-        self._energy = wp.zeros(model.element_count, dtype=precision.vec3, device=self.device)
-        self._steric = wp.zeros(model.element_count, dtype=precision.real, device=self.device)
         self._frames = Frames(self.system, self.scenes)
-        self._reader = CellsReader(self.system, self._energy, self._steric)
+        self._reader = CellsReader(self.system)
         self._excluded = np.zeros(len(self.scenes), dtype=bool)
 
     def __repr__(self) -> str:
@@ -278,15 +276,8 @@ class Simulation:
     @property
     def faults(self) -> dict[int, NumericalError]:
         """The violated guard of each cell that was stopped by one, by cell."""
-        found = {}
-        for cell, code in enumerate(self.system.control.fault.numpy()):
-            if code != control_stage.NO_FAULT:
-                kind, element = health.decode(int(code))
-                flagellum = int(np.searchsorted(self.first_node, element, side="right")) - 1
-                segment = element - int(self.first_node[flagellum])
-                own = flagellum - int(self._first_flagellum[cell])
-                found[cell] = NumericalError(kind, float(self.times[cell]), cell, own, segment)
-        return found
+        codes = self.system.control.fault.numpy()
+        return found_faults(codes, self.times, self.first_node, self._first_flagellum)
 
     def _raise_fault(self) -> None:
         for error in self.faults.values():
