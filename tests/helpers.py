@@ -100,6 +100,8 @@ def attachment(scene: Scene, spec: FlagellumSpec) -> tuple[np.ndarray, np.ndarra
     m = math.cos(angle) * rear + math.sin(angle) * normal
     radius = scene.body.width / 2
     on_cap = max(abs(spec.anchor_offset) - (scene.body.length - scene.body.width) / 2, 0.0)
+    if not scene.body.enabled:
+        return np.zeros(3), m
     surface = spec.anchor_offset * rear + math.sqrt(radius**2 - on_cap**2) * normal
     return surface + scene.hook.length * m, m
 

@@ -30,6 +30,7 @@ SWITCHES = {
     },
     "short": {"numerics.pair_precision": "float32"},
     "hook": {"hook.stiffness": 0.65},
+    "free": {"body.enabled": False, "flagella.count": 1},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
@@ -43,6 +44,7 @@ VARIANTS = [
     ("rkc", "external"),
     ("implicit", "none"),
     ("implicit", "hook"),
+    ("rkc", "free"),
 ]
 
 

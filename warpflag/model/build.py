@@ -79,7 +79,9 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
     m.rod.segment_length = reals(h)
     m.rod.bending_rigidity = reals([g.bending_rigidity for g in group])
     m.rod.twist_rigidity = reals([g.twist_rigidity for g in group])
-    m.rod.hook_rigidity = reals([g.hook_twist_factor * g.twist_rigidity for g in group])
+    m.rod.hook_rigidity = reals(
+        [scenes[c].body.enabled * g.hook_twist_factor * g.twist_rigidity for c, g in zip(owner, group, strict=True)]
+    )
     m.rod.stretching_stiffness = reals([g.stretching_stiffness for g in group])
     m.rod.rest_strain = vectors(
         np.concatenate([_rest_strain(g, spec) for g, spec in zip(group, flagella, strict=True)])
@@ -175,6 +177,10 @@ def _rest_strain(group: Flagella, spec: FlagellumSpec) -> np.ndarray:
 
 def _body_mobility(scene: Scene) -> tuple[float, float, float, float]:
     """Mobility along, across, about and across the axis; an ablated motion has none."""
+    if not scene.body.enabled:  # r_0 is a free end, which carries half a segment
+        (spec,) = scene.resolved_flagella()
+        own = filament_mobility(scene, spec.segment_length)
+        return 2.0 * own.along, 2.0 * own.across, 0.0, 0.0
     m = spheroid_mobility(scene.body.length, scene.body.width, scene.fluid.viscosity)
     moves = scene.body.translation and not scene.body.anchored
     spins = scene.body.axial_rotation and not scene.body.anchored

@@ -90,7 +90,7 @@ class _Cell:
 
     def __init__(self, scene: Scene, start: InitialState) -> None:
         self._scene, self._specs = scene, scene.resolved_flagella()
-        self._with_body = scene.body.contact
+        self._with_body = scene.body.contact and scene.body.enabled
         self._with_others = scene.steric.enabled and 1 < len(self._specs) <= _MOST
         self._diameter = steric_diameter(scene)
         self.nodes = [np.array(x) for x in start.positions]

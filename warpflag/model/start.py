@@ -56,7 +56,7 @@ def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
 
 def check_outside(scene: Scene, start: InitialState) -> None:
     """Refuses a start with nodes inside the body, out of which the contact force would tear them in the first step."""
-    if not scene.body.contact:
+    if not (scene.body.contact and scene.body.enabled):
         return
     to_body = rotations.matrix(start.body_orientation)
     for k, nodes in enumerate(start.positions):

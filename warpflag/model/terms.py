@@ -91,18 +91,19 @@ def _several(scene: Scene) -> bool:
 
 
 SCENE_TERMS = (
-    SceneTerm("motor", lambda scene: True, fill=_fill_motor, power=_motor_power),
+    SceneTerm("motor", lambda scene: scene.body.enabled, fill=_fill_motor, power=_motor_power),
     SceneTerm("elastic", lambda scene: True),
-    SceneTerm("bearing", lambda scene: scene.motor.bearing_torque),
-    SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0, fill=_fill_hook),
+    SceneTerm("bearing", lambda scene: scene.motor.bearing_torque and scene.body.enabled),
+    SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),
     SceneTerm("steric", lambda scene: scene.steric.enabled and _several(scene)),
-    SceneTerm("body contact", lambda scene: scene.body.contact),
+    SceneTerm("body contact", lambda scene: scene.body.contact and scene.body.enabled),
     SceneTerm(
         "external",
         lambda scene: any(map(np.any, _external_forces(scene))),
         fill=_fill_external,
         power=_external_power,
     ),
+    SceneTerm("free end", lambda scene: not scene.body.enabled),
 )
 
 
@@ -111,6 +112,8 @@ def switches_of(scene: Scene) -> Switches:
     pairs = {"as_printed": "all", "consistent": "all"}.get(scene.hydrodynamics.mode, scene.hydrodynamics.mode)
     if not _several(scene):
         pairs = {"all": "within", "between": "none"}.get(pairs, pairs)
+    if not scene.body.enabled and pairs == "within":
+        pairs = "free"
     numerics = scene.numerics
     return Switches(
         pairs=pairs,

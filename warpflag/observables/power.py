@@ -33,7 +33,7 @@ class PowerBalance:
     @property
     def motor(self) -> float:
         """Work of all motors [pN um/s]."""
-        return self.supplied["motor"]
+        return self.supplied.get("motor", 0.0)
 
     @property
     def dissipated(self) -> float:

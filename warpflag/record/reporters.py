@@ -59,12 +59,14 @@ def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> 
         scene: what is run.
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
     """
+    thick = 2 * scene.flagella.filament_radius
+    length, width = (scene.body.length, scene.body.width) if scene.body.enabled else (thick, thick)
     reporter.start(
         dumps(scene),
         first_node,
         filament_radius=scene.flagella.filament_radius,
-        body_length=scene.body.length,
-        body_width=scene.body.width,
+        body_length=length,
+        body_width=width,
         versions=versions(),
     )
 

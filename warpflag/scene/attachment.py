@@ -39,7 +39,10 @@ def motor_axis(spec: FlagellumSpec) -> Vector:
 
 
 def anchor(scene: Scene, spec: FlagellumSpec) -> Vector:
-    """r_0 of a flagellum in body axes [um]: the end of the hook, which stands on the surface along m."""
+    """r_0 of a flagellum in body axes [um]: the end of the hook, which stands on the surface along m. The origin
+    for a free filament."""
+    if not scene.body.enabled:
+        return 0.0, 0.0, 0.0
     around, radius = math.radians(spec.azimuth), surface_radius(scene.body, spec.anchor_offset)
     x, y, z = radius * math.cos(around), radius * math.sin(around), spec.anchor_offset
     a, b, c = motor_axis(spec)

@@ -112,13 +112,13 @@ class Scene(Section, key=""):
         group = self.flagella
         specs = []
         for k, own in enumerate(self.flagellum or (FlagellumOverride(),) * group.count):
-            length = _own(own.length, group.length)
+            length, tilt = _own(own.length, group.length), _own(own.tilt, group.opening_angle / 2)
             specs.append(
                 FlagellumSpec(
                     azimuth=_own(own.azimuth, 360.0 * k / group.count),
                     anchor_offset=_own(own.anchor_offset, group.anchor_offset),
-                    motor_axis_angle=_own(own.motor_axis_angle, self.motor.axis_angle),
-                    tilt=_own(own.tilt, group.opening_angle / 2),
+                    motor_axis_angle=_own(own.motor_axis_angle, self.motor.axis_angle) if self.body.enabled else tilt,
+                    tilt=tilt,
                     torque=_own(own.torque, self.motor.torque),
                     length=length,
                     segment_count=_own(own.segments, math.floor(length / group.segment_length + 0.5)),
@@ -128,6 +128,14 @@ class Scene(Section, key=""):
         return tuple(specs)
 
     def _check_body(self) -> None:
+        if not self.body.enabled:
+            if self.flagella.count > 1:
+                problem = "must be 1 where body.enabled = false: a free filament is alone"
+                raise SceneError("flagella.count", self.flagella.count, problem, ["body.enabled"])
+            if any(self.external.body_force):
+                problem = "must be zero where body.enabled = false"
+                raise SceneError("external.body_force", self.external.body_force, problem, ["body.enabled"])
+            return
         if self.body.width > self.body.length:
             problem = f"must not be above body.length = {self.body.length:g} um"
             raise SceneError("body.width", self.body.width, problem, ["body.length"])
@@ -224,7 +232,7 @@ class Scene(Section, key=""):
 
     def _check_anchor(self, k: int, spec: FlagellumSpec) -> None:
         pole = self.body.length / 2
-        if self.body.width <= self.body.length and pole < abs(spec.anchor_offset) - 1e-9:
+        if self.body.enabled and self.body.width <= self.body.length and pole < abs(spec.anchor_offset) - 1e-9:
             own = self.flagellum and self.flagellum[k].anchor_offset is not None
             key = f"flagellum.{k}.anchor_offset" if own else "flagella.anchor_offset"
             problem = f"is beyond the ends of the body, {-pole:g} to {pole:g} um"

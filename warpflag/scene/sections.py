@@ -199,6 +199,7 @@ class Body(Section, key="body"):
 
     length: float = number(2.5, "um", 0.1, 100, "L_b, caps included")
     width: float = number(0.8, "um", 0.05, 50, "d_b, not above the length")
+    enabled: bool = switch(True, "false: a free filament without body, motor and hook, whose r_0 is a free end")
     contact: bool = switch(True, "the body's surface repels the nodes of flagella")
     translation: bool = switch(True, "the body moves")
     axial_rotation: bool = switch(True, "the body turns about its long axis")

@@ -23,7 +23,8 @@ class Switches:
     """The terms that the scenes of a batch ask for. What is off is not compiled, allocated or launched.
 
     Attributes:
-        pairs: which nodes the Rotne-Prager sum couples: "none", "within" one flagellum, "between" flagella, or "all".
+        pairs: which nodes the Rotne-Prager sum couples: "none", "within" one flagellum, "between" flagella, or "all";
+            "free": those of a free filament, r_0 among them.
         terms: names of the force terms, see `warpflag_kernels.stepping.terms`.
         short_pairs: whether a float64 run has the pairs of the sum in float32, and their sums in float64.
     """
@@ -123,7 +124,7 @@ def choose_plan(device: Any, precision: Precision, switches: Switches, largest_c
     step_pairs = "gathered"
     if switches.pairs == "none":
         pair_sum = "none"
-    elif by_cells:
+    elif by_cells and switches.pairs != "free":  # nothing touches a free filament
         step_pairs = "stored" if largest_cell <= STORED_NODES else "symmetric"
     return Plan(
         device=device,

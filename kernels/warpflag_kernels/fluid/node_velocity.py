@@ -48,14 +48,18 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
     @wp.func(module=module)
     def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, thread: wp.int32):
         """Velocity of node e of flagellum k of cell c; the threads of a warp share its pairs."""
-        if e == model.first_node[k]:
+        if wp.static(pairs != "free") and e == model.first_node[k]:
             state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.pose.position[e])
             return
         v = drag_velocity(model, state, e, k)
+        if wp.static(pairs == "free") and e == model.first_node[k]:
+            v = state.body_velocity[c]  # a free end, by its local mobility so far
         if wp.static(pairs != "none"):
             v += model.pairs.mobility[c] * flow_at(model, s, e, k, c, thread)
         if thread == 0:
             state.velocity[e] = v
+            if wp.static(pairs == "free") and e == model.first_node[k]:
+                state.body_velocity[c] = v
 
     @wp.func(module=module)
     def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
@@ -91,7 +95,7 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
         e = wp.tid()
         x = state.pose.position[e]
         force = state.force[e]
-        if e == model.first_node[model.flagellum_of[e]]:
+        if wp.static(pairs != "free") and e == model.first_node[model.flagellum_of[e]]:
             force = vec3(p.real(0.0))
         s.x[e] = real(x[0])
         s.y[e] = real(x[1])

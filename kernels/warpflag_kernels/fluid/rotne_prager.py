@@ -4,7 +4,7 @@
     r <= 2a:  1/(6 pi eta a) [(1 - 9r/32a) I + (3r/32a) rr]
 
 It runs over the distinct nodes of the same flagellum, of the others, or both, as the scene says. r_0 belongs to the
-body: it moves with the body and its force enters the sum as zero.
+body: it moves with the body and its force enters the sum as zero. Only in a free filament it is a node like others.
 
 On a GPU the threads of a warp gather the flows at one node together, an order of magnitude faster than a thread for
 each node, of which a cell has too few. A CPU, where one thread does a whole cell, takes every pair once for both nodes
@@ -114,7 +114,7 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
     vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
     Model, State, PairSum = structs(p).Model, structs(p).State, struct(pair)
     module = p.module("pair_sum", "_".join([pairs, form, *["short"] * short]))
-    within, between = pairs in ("within", "all"), pairs in ("between", "all")
+    within, between = pairs in ("within", "all", "free"), pairs in ("between", "all")
     symmetric, threads = form == "symmetric", WARP if form == "warp" else 1
     add_row, gather_pairs, warp_sum = rows(pair, threads).add_row, rows(pair, threads).gather_pairs, over_warp(p)
 
@@ -134,7 +134,7 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
         a = real(model.pairs.radius[c])
         pack_cell(state.pose.position, state.force, s, begin, end)
         k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
+        while wp.static(pairs != "free") and k < model.first_flagellum[c + 1]:
             i = model.first_node[k]
             s.fx[i] = real(0.0)
             s.fy[i] = real(0.0)

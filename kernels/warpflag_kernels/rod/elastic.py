@@ -45,6 +45,8 @@ def functions(p: Precision) -> SimpleNamespace:
         sine, cosine = twist(t, u, a1, b1)
         turned = angle(sine, cosine)
         if e == model.first_node[k]:
+            if model.rod.hook_rigidity[k] == real(0.0):
+                return  # a free end: no gradients, which stay zero, at any angle to the tripod
             moment = model.rod.hook_rigidity[k] * per_length * turned
             gradient = (real(0.5) * moment) * kb
             state.joint_before[e] = gradient
@@ -189,7 +191,9 @@ def _kernels(p: Precision) -> SimpleNamespace:
             w = joint_strain(
                 state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
             )
-            if e == first:
+            if e == first and model.rod.hook_rigidity[k] == real(0.0):
+                twist = real(0.0)
+            elif e == first:
                 twist = real(0.5) * model.rod.hook_rigidity[k] / h * w[2] * w[2]
             else:
                 d = w - model.rod.rest_strain[e]

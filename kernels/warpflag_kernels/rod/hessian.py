@@ -74,6 +74,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             stiffness.stretch[i] = (stretching / h) * tt + (stretching * strain / le) * (identity - tt)
         if i + 1 == model.first_node[k + 1]:
             return
+        if i == first and model.rod.hook_rigidity[k] == real(0.0):
+            return  # a free end: all of it stays zero
         u = state.pose.tangent[i + 1]
         lf = state.pose.length[i + 1]
         a1 = state.pose.director[i]

@@ -144,7 +144,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             and wp.abs(state.pose.length[e] / model.rod.segment_length[k] - real(1.0)) > largest_strain
         ):
             wp.atomic_min(control.fault, c, strained + e)
-        if e + 1 < model.first_node[k + 1]:
+        free_end = e == model.first_node[k] and model.rod.hook_rigidity[k] == real(0.0)
+        if e + 1 < model.first_node[k + 1] and not free_end:
             t = state.pose.tangent[e]
             u = state.pose.tangent[e + 1]
             if real(1.0) + wp.dot(t, u) < smallest_fold:

@@ -6,8 +6,9 @@ from warpflag_kernels.motor.hook import HOOK
 from warpflag_kernels.motor.torque import MOTOR
 from warpflag_kernels.rod.elastic import BEARING, ELASTIC
 from warpflag_kernels.rod.external import EXTERNAL
+from warpflag_kernels.rod.free_end import FREE_END
 
-TERMS = (MOTOR, ELASTIC, BEARING, HOOK, STERIC, BODY_CONTACT, EXTERNAL)
+TERMS = (MOTOR, ELASTIC, BEARING, HOOK, STERIC, BODY_CONTACT, EXTERNAL, FREE_END)
 
 
 def terms_named(names: tuple[str, ...]) -> tuple[Term, ...]:
