@@ -75,7 +75,7 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
     with frame_by_frame():
         (outcome,) = started.execute_all(quiet=True, watch=watch)
     assert outcome.status == "stopped"
-    assert "\n" not in outcome.message and "flagellum" in outcome.message and "numerics.time_step" in outcome.message
+    assert "\n" not in outcome.message and "flagellum" in outcome.message and "twisted" in outcome.message
     said = summary(tmp_path / "made")
     assert said["status"] == "stopped" and said["guards"]["violated"]["time"] > said["time"]
     assert said["message"] in outcome.message

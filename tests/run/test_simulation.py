@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from tests.runs import assert_same_frames, ended_at, executed, frame_by_frame, small
 from warpflag.record import Frame, Record
 from warpflag.record.recorder import Recorder
+from warpflag.record.reporters import start_reporter
 from warpflag.run import run
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import SceneError
@@ -75,12 +77,27 @@ def test_a_scene_starts_from_a_frame_of_a_record(tmp_path):
         ({"start.frame": 9}, "frames 0 to 8"),
         ({"flagella.anchor_offset": 0.5}, "anchors flagellum 0 elsewhere"),
         ({"start.record": "nowhere"}, "no such record"),
+        ({"flagella.length": 2.06, "flagella.segment_length": 0.206}, "segments of 0.1997 um in flagellum 0"),
     ],
 )
 def test_a_record_of_another_cell_is_no_start(values, words, tmp_path):
     directory = executed(small(), tmp_path / "made")
     with pytest.raises(SceneError, match=words):
         Simulation(small({"start.record": str(directory), **values}), device="cpu")
+
+
+@pytest.mark.parametrize("what", ["positions", "directors", "body_orientation"])
+def test_a_record_that_is_not_finite_is_no_start(what, tmp_path):
+    simulation = Simulation(small(), device="cpu")
+    frame = next(simulation.frames(8e-5))
+    values = np.array(getattr(frame, what))
+    values.flat[5 if values.ndim == 2 else 1] = np.nan
+    recorder = Recorder(tmp_path / "run.h5")
+    start_reporter(recorder, small(), simulation.first_node)
+    recorder.write(dataclasses.replace(frame, **{what: values}))
+    recorder.close()
+    with pytest.raises(SceneError, match="not finite"):
+        Simulation(small({"start.record": str(tmp_path)}), device="cpu")
 
 
 def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path):

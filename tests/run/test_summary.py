@@ -78,7 +78,7 @@ def test_what_is_not_finite_is_none_in_a_file():
 
 
 def test_refused_steps_are_counted_once(tmp_path):
-    scene = small({"numerics.accuracy": 1e-8, "duration": 4e-5, "frames": 4})
+    scene = small({"numerics.accuracy": 1e-8, "numerics.on_accuracy": "warn", "duration": 4e-5, "frames": 4})
     said = summary(executed(scene, tmp_path / "made"))
     assert said["rejected_steps"] > 0  # or this scene no longer tells refused steps from others: take a harder one
     assert said["evaluations"] == said["steps"] + said["rejected_steps"]  # one a step, refused or not

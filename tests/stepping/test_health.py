@@ -298,3 +298,36 @@ def test_crossings_are_those_of_dense_sampling(looked_at, device, precision):
         assert not answer[away].any(), np.flatnonzero(away & answer)
         crossings, silent = crossings + crossed.sum(), silent + (away & turned).sum()
     assert crossings > 200 and silent > 200
+
+
+@pytest.mark.parametrize(("apart", "kind"), [(0.0, Fault.CROSSING), (1e-3, Fault.CROSSING), (4e-3, None), (0.03, None)])
+@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
+def test_a_start_whose_flagella_touch_is_refused(apart, kind, stepper, device, precision):
+    """Two straight flagella that cross in the middle, so far apart [um]."""
+    scene = cell({"numerics.stepper": stepper}, precision)
+    anchors = np.array([attachment(scene, spec)[0] for spec in scene.resolved_flagella()])
+    meeting = anchors.mean(axis=0) + np.array([0.0, 0.0, 1.5])
+    across = unit(np.cross(anchors[1] - anchors[0], [0.0, 0.0, 1.0]))
+    nodes = []
+    for anchor, spec, shift in zip(anchors, scene.resolved_flagella(), (0.0, apart), strict=True):
+        along = unit(meeting + shift * across - anchor)
+        nodes.append(anchor + spec.segment_length * np.arange(1, spec.segment_count + 1)[:, None] * along)
+    sim = Simulation(scene, device=device, starts=placed(scene, nodes))
+    sim.prepare()
+    assert [fault.kind for fault in sim.faults.values()] == ([] if kind is None else [kind])
+
+
+def test_a_fixed_step_beyond_its_stages_is_an_error(device, precision):
+    """As if the spectral radius had grown within the step."""
+    sim = Simulation(cell({"numerics.time_step": 1e-6}, precision), device=device)
+    sim.advance(5e-6)
+    steps = sim.steps[0]
+    sim.stepper.data.stages.fill_(3)
+    words = "beyond what its stages keep stable; take a shorter numerics.time_step"
+    with pytest.raises(NumericalError, match=words) as caught:
+        sim.advance(2e-5)
+    assert caught.value.kind == Fault.UNSTABLE and sim.steps[0] == steps
+    controlled = Simulation(cell({}, precision), device=device)
+    controlled.advance(5e-6)
+    controlled.stepper.data.stages.fill_(3)
+    controlled.advance(6e-6)  # its estimates see an unstable step

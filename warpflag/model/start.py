@@ -12,6 +12,8 @@ from warpflag.scene import Scene, SceneError, attachment
 
 __all__ = ["check_outside", "shape_of_frame", "starting_state"]
 
+_MEAN_STRAIN = 0.01  # of a flagellum, beyond which a record is of one of another length
+_TENSION = 10.0  # pN; what may stretch a soft one by more
 _ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
 
 
@@ -40,6 +42,8 @@ def starting_state(scene: Scene) -> InitialState:
         problem = f"holds flagella of {recorded} segments, the scene's have {counts}"
         raise SceneError(*_record_of(scene), problem, ["flagella.count", "flagella.length"])
     start = shape_of_frame(frame, first_node)
+    _check_finite(scene, start)
+    _check_lengths(scene, start)
     _check_anchors(scene, start)
     return start
 
@@ -64,6 +68,24 @@ def check_outside(scene: Scene, start: InitialState) -> None:
         if gaps.min() < 0.0:
             deep = f"node {int(gaps.argmin()) + 1} is {-gaps.min():.3g} um deep"
             raise SceneError("body.contact", True, f"the given start has flagellum {k} inside the body: {deep}")
+
+
+def _check_finite(scene: Scene, start: InitialState) -> None:
+    for k, (nodes, directors) in enumerate(zip(start.positions, start.directors, strict=True)):
+        if not (np.isfinite(nodes).all() and np.isfinite(directors).all()):
+            raise SceneError(*_record_of(scene), f"has values that are not finite in flagellum {k}")
+    if not (np.isfinite(start.body_position).all() and np.isfinite(start.body_orientation).all()):
+        raise SceneError(*_record_of(scene), "has a body whose pose is not finite")
+
+
+def _check_lengths(scene: Scene, start: InitialState) -> None:
+    """A record of longer or shorter flagella would begin stretched as a whole, which no load does to stiff segments."""
+    allowed = max(_MEAN_STRAIN, _TENSION / scene.flagella.stretching_stiffness)
+    for k, (spec, nodes) in enumerate(zip(scene.resolved_flagella(), start.positions, strict=True)):
+        mean = float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).mean())
+        if abs(mean / spec.segment_length - 1) > allowed:
+            problem = f"has segments of {mean:.4g} um in flagellum {k}, the scene's are of {spec.segment_length:.4g} um"
+            raise SceneError(*_record_of(scene), problem, ["flagella.length", "flagella.segment_length"])
 
 
 def _check_anchors(scene: Scene, start: InitialState) -> None:

@@ -12,6 +12,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from warpflag_kernels.stepping.health import Fault
 
 from warpflag.base.progress import Progress
 from warpflag.record import RecordError
@@ -20,6 +21,7 @@ from warpflag.run.faults import NumericalError
 from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
+from warpflag.run.summary import accuracy_kept
 
 __all__ = ["Run"]
 
@@ -164,8 +166,18 @@ class Run:
         """Ends members that have reached the end of their scenes."""
         self._save(cells)
         for cell in cells:
-            finish = functools.partial(self.members[cell].finish, "done", movie=self.movies)
-            self._guarded(cell, lambda c=cell, f=finish: f(self._facts(c)))
+            facts, scene = self._facts(cell), self.members[cell].scene
+            fault = None
+            if facts["accuracy"]["beyond"] and scene.numerics.on_accuracy == "stop" and not scene.numerics.time_step:
+                fault = NumericalError(Fault.ACCURACY, float(self._copied_times()[cell]), cell, 0, 0, scene)
+                facts = self._facts(cell, fault)
+            status = "stopped" if fault else "done"
+            finish = functools.partial(self.members[cell].finish, status, facts, fault, movie=self.movies)
+            self._guarded(cell, finish)
+
+    def _copied_times(self) -> np.ndarray:
+        """Time of every cell at the last copy [s], shape [cell_count]."""
+        return self._copy["control.time"]
 
     def _guarded(self, cell: int, action: Callable[[], Any]) -> Any:
         """What a member does with its files; where the machine refuses, the member ends and the others go on."""
@@ -233,7 +245,13 @@ class Run:
             "duration": scene.duration,
             "steps": copied["control.steps"][0],
             "rejected_steps": copied["stepper.rejected"][0] if "stepper.rejected" in copied else 0,
+            # Of the implicit stepper: steps attempted, each of two evaluations; of the others: right-hand sides.
             "evaluations": copied["stepper.evaluations"][0],
+            "accuracy": accuracy_kept(scene, copied),
+            "balance": {
+                "judged": getattr(simulation.stepper, "balanced", False),
+                "violations": copied["stepper.balance_refused"][0] if "stepper.balance_refused" in copied else 0,
+            },
             "batch": len(self.members),
             "start": list(simulation.notes[cell]),
             "guards": {"steps_between_checks": simulation.system.guard.interval.numpy()[cell], "violated": violated},

@@ -23,7 +23,7 @@ from warpflag.run.faults import NumericalError
 from warpflag.run.lock import Lock
 from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, sync, write_whole
 from warpflag.run.stop import Ended
-from warpflag.run.summary import digest, plain
+from warpflag.run.summary import digest, kept_words, plain
 from warpflag.scene import Scene
 
 __all__ = ["Member", "Outcome"]
@@ -176,10 +176,13 @@ class Member:
                 left_out = _movie(record, self.directory / MOVIE_NAME)
         count = found["frames"]
         reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
+        kept = kept_words(facts["accuracy"])
         if status == "done":
-            return f"{reached} in {self.wall_time:.1f} s: {self.directory}{left_out}"
+            said = f", {kept}" if kept else ""
+            return f"{reached} in {self.wall_time:.1f} s{said}: {self.directory}{left_out}"
         if status == "stopped":
-            return f"{fault}; {reached} kept in {self.directory}{left_out}"
+            said = f"; {kept}" if kept else ""
+            return f"{fault}{said}; {reached} kept in {self.directory}{left_out}"
         return f"{how}, {reached} kept{left_out}; resumable with --resume {self.directory}"
 
 

@@ -19,13 +19,13 @@ from warpflag.base.device import LAUNCHING, alone, find_device
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import check_outside
+from warpflag.model.starts import starting_states
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, start_reporter
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames
-from warpflag.run.starts import starting_states
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 
@@ -277,7 +277,7 @@ class Simulation:
     def faults(self) -> dict[int, NumericalError]:
         """The violated guard of each cell that was stopped by one, by cell."""
         codes = self.system.control.fault.numpy()
-        return found_faults(codes, self.times, self.first_node, self._first_flagellum)
+        return found_faults(codes, self.times, self.first_node, self._first_flagellum, self.scenes)
 
     def _raise_fault(self) -> None:
         for error in self.faults.values():

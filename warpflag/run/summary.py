@@ -7,16 +7,22 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from warpflag_kernels.stepping import accuracy
 
 from warpflag import observables
 from warpflag.observables.behaviour import of_record as behaviour
 from warpflag.record import Record
 from warpflag.scene import Scene
+from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
-__all__ = ["digest", "plain"]
+__all__ = ["accuracy_kept", "digest", "kept_words", "plain"]
 
 SYNCHRONISED = 0.15
 """Phase difference below which two flagella count as synchronised."""
+
+
+_NOTABLE = 2.0
+"""A worst window is told where it is this many times the mean and what was asked."""
 
 
 def digest(record: Record, scene: Scene) -> dict[str, Any]:
@@ -45,6 +51,44 @@ def digest(record: Record, scene: Scene) -> dict[str, Any]:
         },
     }
     return found | {"behaviour": behaviour.digest(record)} if scene.behaviour else found
+
+
+def accuracy_kept(scene: Scene, checkpoint: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """What the error estimates of all steps add up to, by the checkpoint of one cell.
+
+    Returns:
+        `asked` of the steps [um/ms]; their `estimate` over the whole run and in the `worst_window` of 0.1 ms [um/ms],
+        the end of that window, `worst_window_end` [s]; None where no step has an estimate. `beyond`: whether a run that
+        ends here has erred by more than ten times what was asked. `steps_at_shortest`: steps that were wanted shorter
+        than the shortest that an estimate may ask for.
+    """
+    asked = scene.numerics.accuracy or DEFAULT_ACCURACY
+    facts = {"asked": asked, "estimate": None, "worst_window": None, "worst_window_end": None, "beyond": False}
+    facts["steps_at_shortest"] = 0
+    if "stepper.achieved_total" not in checkpoint or scene.numerics.stepper == "euler":
+        return facts
+    own = {name: float(checkpoint[f"stepper.achieved_{name}"][0]) for name in (*accuracy.SUMS, "at_shortest")}
+    independent = scene.numerics.stepper == "implicit"
+    found = accuracy.estimates(own, independent)
+    if found is None:
+        return facts
+    ends = own["worst_end"] if found[1] == own["worst"] else float(checkpoint["control.time"][0])
+    facts |= {"estimate": asked * found[0], "worst_window": asked * found[1], "worst_window_end": ends}
+    facts["beyond"] = accuracy.last_span(own, independent) > accuracy.BEYOND
+    return facts | {"steps_at_shortest": int(own["at_shortest"])}
+
+
+def kept_words(facts: Mapping[str, Any]) -> str:
+    """What `accuracy_kept` found, for the last line of a run; empty where there is no estimate."""
+    if facts["estimate"] is None:
+        return ""
+    mean, worst = facts["estimate"] / facts["asked"], facts["worst_window"] / facts["asked"]
+    words = f"error estimate {mean:.2g} times {facts['asked']:g} um/ms"
+    if worst > max(_NOTABLE, _NOTABLE * mean):
+        words += f", {worst:.2g} times in 0.1 ms up to {1e3 * facts['worst_window_end']:.4g} ms"
+    if facts["steps_at_shortest"]:
+        words += f", {facts['steps_at_shortest']} steps as short as estimates may ask for"
+    return words
 
 
 def plain(value: Any) -> Any:

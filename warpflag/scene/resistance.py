@@ -17,12 +17,14 @@ __all__ = [
     "FilamentMobility",
     "SpheroidMobility",
     "filament_mobility",
+    "pace",
     "pair_radius",
     "spheroid_mobility",
     "steric_diameter",
 ]
 
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
+_PRINTED = (1.6e-3, 2.8e-3, 1.26e-6)  # gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s] of the paper
 _ZETA_3 = 1.2020569031595942
 _SOUND = 1 - 1e-9  # round-off of the condition that a pair radius was chosen by
 
@@ -143,9 +145,14 @@ def _drag(scene: Scene) -> tuple[float, float, float]:
     """gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s]; the paper's belong to water and scale with viscosity."""
     fluid, scale = scene.fluid, scene.fluid.viscosity / _WATER
     given = (fluid.drag_parallel, fluid.drag_perpendicular, fluid.drag_rotation)
-    printed = (1.6e-3, 2.8e-3, 1.26e-6)
-    values = [p * scale if g is None else g for g, p in zip(given, printed, strict=True)]
+    values = [p * scale if g is None else g for g, p in zip(given, _PRINTED, strict=True)]
     return values[0], values[1], values[2]
+
+
+def pace(scene: Scene) -> float:
+    """How many times as fast as with the paper's drag in water a flagellum moves under given forces."""
+    found = zip((*_drag(scene), scene.fluid.viscosity), (*_PRINTED, _WATER), strict=True)
+    return max(printed / value for value, printed in found)
 
 
 def _slender_body(h: float, radius: float, a_pair: float) -> tuple[float, float]:

@@ -244,6 +244,9 @@ class Numerics(Section, key="numerics"):
         "wanted node error per simulated ms",
         derived="5e-3, but euler takes fixed steps",
     )
+    on_accuracy: str = choice(
+        "stop", ("stop", "warn"), "what happens when error estimates are beyond ten times the accuracy"
+    )
     pair_precision: str = choice(
         "same",
         ("same", "float32"),

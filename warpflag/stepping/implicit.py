@@ -25,11 +25,11 @@ from warpflag_kernels.implicit import (
     step_flow,
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian
-from warpflag_kernels.stepping import dense_output, health, step_control
+from warpflag_kernels.stepping import balance, dense_output, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 from warpflag.scene import Scene
-from warpflag.stepping.stepper import DEFAULT_ACCURACY, STEP_MEMORY, System, restart_step_control
+from warpflag.stepping.stepper import System, allocated_control, recalled, restart_step_control, step_memory
 
 __all__ = ["History", "ImplicitStepper", "Scratch"]
 
@@ -98,6 +98,8 @@ class ImplicitStepper:
     Attributes:
         data: the struct `Implicit`.
         steps: the struct `StepControl`.
+        balanced: whether the power balance of every step is asked for.
+        balance: the struct `Balance`.
         stability: the struct `Stability`; None where nodes cause no flows.
         history: increments of the last two steps.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the pose that was linearised last.
@@ -116,10 +118,13 @@ class ImplicitStepper:
         self.contacts = contact_list.allocate(model, self._touching)
         self.law, self.flow = delassus.allocate(model, self.contacts), step_flow.allocate(model)
         quasi_newton.allocate(model, self.contacts, self.law)
-        self.data = collocation.allocate(model)
+        self.data, self.balanced, self.balance = (
+            collocation.allocate(model),
+            balance.holds(model),
+            balance.allocate(model),
+        )
         fixed = [scene.numerics.time_step for scene in scenes]
-        accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
-        self.steps = step_control.allocate(accuracies, model.device)
+        self.steps = allocated_control(scenes, [bool(f) for f in fixed], model.device)
         # Without flows between nodes the matrix is the whole of the linearised equations.
         self.stability: Any = None
         if model.switches.pairs != "none":
@@ -136,7 +141,7 @@ class ImplicitStepper:
         s, i, band, x = self._system, self.data, self.band, self._scratch
         model, state, pose, device = s.model, s.state, s.state.data.pose, s.model.device
         last, before = self.history.last, self.history.before
-        k = collocation.kernels(model.precision)
+        k = collocation.kernels(model.precision, self.balanced)
         inputs = [model.data, state.data, self.steps, s.control, i, band, self.contacts, self.law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         # The first iteration, where the last steps lead.
@@ -159,6 +164,8 @@ class ImplicitStepper:
         if self._touching:
             search.renew(model, state, pose, self.contacts)
         self._evaluate()
+        if self.balanced:
+            balance.gather(model, state, self.balance)
         solution = self._solve(x.last_at_second, x.found, first=False)
         inputs = [model.data, state.data, x.last_at_second, x.found, x.expected, solution]
         inputs += [i, x.total, x.remaining, s.chart]
@@ -166,9 +173,12 @@ class ImplicitStepper:
         moved = self._moved_history
         transported = (x.total, x.last_at_second, moved.last, moved.before)
         chain_chart.retract(model, state, pose, i.one, x.remaining, pose, transported)
+        if self.balanced:
+            balance.weigh(model, state, x.total, self.balance)
         # What was found is judged, and kept or dropped.
         health.check(model, state, s.chart, s.guard, s.control, self.contacts if self._touching else None)
         inputs = [model.data, state.data, band, self.contacts, self.law, s.chart, s.control, self.steps, i]
+        inputs.append(self.balance)
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
         if self.dense is not None:
             dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
@@ -207,7 +217,7 @@ class ImplicitStepper:
         """
         model, state, x = self._system.model, self._system.state, self._scratch
         inputs = [model.data, state.data, self.data, self.band, self.law, last, found, x.free]
-        kernel = collocation.kernels(model.precision).right_hand_side
+        kernel = collocation.kernels(model.precision, self.balanced).right_hand_side
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
         linear_system.solve(model, state, self.band, x.free)
         if self._touching:
@@ -244,6 +254,8 @@ class ImplicitStepper:
         self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
         self.data.history.zero_()
         self.data.trust.zero_()
+        self.balance.known.zero_()
+        self.balance.lasting.zero_()
         if self.stability is not None:
             self.stability.kappa.zero_()
             self.stability.strong.zero_()
@@ -252,7 +264,8 @@ class ImplicitStepper:
     def memory(self) -> dict[str, np.ndarray]:
         names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "trust")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
-        kept |= {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
+        kept |= step_memory(self.steps)
+        kept |= {f"balance_{name}": getattr(self.balance, name).numpy().copy() for name in balance.MEMORY}
         if self.stability is not None:
             kept |= {name: getattr(self.stability, name).numpy().copy() for name in _STABILITY_MEMORY}
         for name, x in self._increments_kept().items():
@@ -261,15 +274,17 @@ class ImplicitStepper:
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         kept = self._increments_kept()
-        for name, values in memory.items():
+        for name, values in recalled(self.steps, memory).items():
             whose, _, part = name.partition("_")
             if part in ("node", "body"):
                 getattr(kept[whose], part).assign(values)
+            elif whose == "balance":
+                getattr(self.balance, part).assign(values)
             elif name in _STABILITY_MEMORY:
                 getattr(self.stability, name).assign(values)
                 self.stability.any_strong.fill_(1)  # found anew in the first pass
             else:
-                getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
+                getattr(self.data, name).assign(values)
 
     def _increments_kept(self) -> dict[str, Any]:
         """Increments that a resumed run needs."""

@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.rod import comoving_chart, reconstruction
-from warpflag_kernels.stepping import dense_output, health, rkc, step_control
+from warpflag_kernels.stepping import dense_output, health, rkc, rkc_arrays
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import filament_mobility
-from warpflag.stepping.stepper import DEFAULT_ACCURACY, STEP_MEMORY, System, restart_step_control
+from warpflag.stepping.stepper import System, allocated_control, recalled, restart_step_control, step_memory
 
 __all__ = ["EULER_STEPS_PER_CHECK", "RkcStepper", "euler_step"]
 
@@ -50,14 +50,12 @@ class RkcStepper:
     def __init__(self, system: System, scenes: Sequence[Scene], euler: bool) -> None:
         self._system, self._euler = system, euler
         device = system.model.device
-        self.data = rkc.allocate(system.model)
+        self.data = rkc_arrays.allocate(system.model)
         fixed = [bool(s.numerics.time_step) or euler for s in scenes]
-        accuracies = [0.0 if f else s.numerics.accuracy or DEFAULT_ACCURACY for f, s in zip(fixed, scenes, strict=True)]
-        self.steps = step_control.allocate(accuracies, device)
+        self.steps = allocated_control(scenes, fixed, device)
         longest = [s.numerics.time_step or (euler_step(s) if euler else LONGEST_STEP) for s in scenes]
         system.control.longest_step.assign(longest)
         system.guard.interval.fill_(EULER_STEPS_PER_CHECK if euler else 1)
-        self._controlled = any(accuracies)
         self.dense: DenseOutput | None = None
         self.ends_at_frames = euler  # which is checked at targets, and not after every step
         self._seed_probe()
@@ -77,7 +75,7 @@ class RkcStepper:
     def _launch_between_steps(self) -> None:
         s = self._system
         health.check(s.model, s.state, s.chart, s.guard, s.control)
-        if not self._euler and self._controlled:
+        if not self._euler:
             comoving_chart.increment_rates(s.model, s.state, s.chart)
             rkc.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
         if self.dense is not None:
@@ -97,11 +95,11 @@ class RkcStepper:
         names = ("stage", "start_rate", "body_start_rate", "evaluations")
         names += ("probe", "probe_norm", "probes_left", "spectral_radius")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
-        return kept | {name: getattr(self.steps, name).numpy().copy() for name in STEP_MEMORY}
+        return kept | step_memory(self.steps)
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
-        for name, values in memory.items():
-            getattr(self.steps if name in STEP_MEMORY else self.data, name).assign(values)
+        for name, values in recalled(self.steps, memory).items():
+            getattr(self.data, name).assign(values)
 
     def _seed_probe(self) -> None:
         """A direction with a share of every mode: random, but the same in every run and every cell."""

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from warpflag_kernels.base.types import DeviceModel, DeviceState
+from warpflag_kernels.stepping import accuracy, step_control
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 
-__all__ = ["DEFAULT_ACCURACY", "STEP_MEMORY", "Stepper", "System", "restart_step_control"]
+from warpflag.scene import Scene
+from warpflag.scene.resistance import pace
+
+__all__ = [
+    "DEFAULT_ACCURACY",
+    "Stepper",
+    "System",
+    "allocated_control",
+    "recalled",
+    "restart_step_control",
+    "step_memory",
+]
 
 
 @dataclass(frozen=True)
@@ -30,14 +43,39 @@ FIRST_STEP = 1.0e-8
 
 
 def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
-    """Forgets the estimates; the first step is `FIRST_STEP` under control, `fixed_start` [s] otherwise."""
+    """Forgets the estimates; the first step is `FIRST_STEP` under control, in thin fluids less, `fixed_start` [s]
+    otherwise."""
     c.error_sum.zero_()
     c.error_time.zero_()
     c.rejected_error.zero_()
-    c.wanted_step.assign(np.where(c.error_rate.numpy() > 0.0, FIRST_STEP, fixed_start))
+    first = FIRST_STEP / step_control.SHORTEST_STEP * c.shortest.numpy()
+    c.wanted_step.assign(np.where(c.error_rate.numpy() > 0.0, first, fixed_start))
 
 
-STEP_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")
+def allocated_control(scenes: Sequence[Scene], fixed: Sequence[bool], device: Any) -> Any:
+    """The struct `StepControl` of scenes, of which some have fixed steps."""
+    accuracies = [scene.numerics.accuracy or DEFAULT_ACCURACY for scene in scenes]
+    stopping = [scene.numerics.on_accuracy == "stop" for scene in scenes]
+    return step_control.allocate(accuracies, fixed, stopping, [pace(scene) for scene in scenes], device)
+
+
+_CONTROL_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")
+_ACHIEVED_MEMORY = (*accuracy.SUMS, "at_shortest")
+
+
+def step_memory(steps: Any) -> dict[str, np.ndarray]:
+    """What a resumed run needs of the struct `StepControl`."""
+    kept = {name: getattr(steps, name).numpy().copy() for name in _CONTROL_MEMORY}
+    return kept | {f"achieved_{name}": getattr(steps.achieved, name).numpy().copy() for name in _ACHIEVED_MEMORY}
+
+
+def recalled(steps: Any, memory: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Takes back what `step_memory` gave; returns what else there is."""
+    arrays = {name: getattr(steps, name) for name in _CONTROL_MEMORY}
+    arrays |= {f"achieved_{name}": getattr(steps.achieved, name) for name in _ACHIEVED_MEMORY}
+    for name, array in arrays.items():
+        array.assign(memory[name])
+    return {name: values for name, values in memory.items() if name not in arrays}
 
 
 class Stepper(Protocol):

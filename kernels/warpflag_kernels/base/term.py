@@ -37,7 +37,10 @@ class Term:
             on_node(model, state, e, k, force): adds a force on node e [pN]; what acts on r_0 goes to the body;
             on_spin(model, state, e, k, torque): adds a torque on segment e about its tangent [pN um];
             on_body(model, state, k, force, torque): adds what the term puts on the body beside the anchors' forces, the
-                share of flagellum k, to a force [pN] and a torque about the body's centre [pN um], and returns both.
+                share of flagellum k, to a force [pN] and a torque about the body's centre [pN um], and returns both;
+            energy(model, state, e, k, energy): adds what the term has stored at element e, its segment and the joint
+                after it, to `energy` [pN um], in float64. Its forces are then minus the gradient of that. The forces of
+                a term without it count as work from outside in the power balance of a step.
 
         contact: whether an implicit step solves for the term's forces instead of evaluating them.
         linearised: the term whose forces are this one's first variation; its launch is
@@ -45,6 +48,8 @@ class Term:
             found with that of another term.
         stiffness: sets or adds to the second derivatives of the energy in the matrix of an implicit step,
             `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
+        balanced: whether the power balance of a step holds with it: not with random forces, nor where what it stores
+            changes at a pose that stands still.
     """
 
     name: str
@@ -53,6 +58,7 @@ class Term:
     contact: bool = False
     linearised: "Term | None" = None
     stiffness: Callable[..., None] | None = None
+    balanced: bool = True
 
 
 def variant(terms: Sequence[Term]) -> str:
@@ -118,6 +124,7 @@ def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
         on_node=added(of("on_node"), vec3),
         on_spin=added(of("on_spin"), real),
         on_body=loaded(of("on_body")),
+        energy=added(of("energy"), wp.float64),
         in_cell=of("in_cell"),
         in_flagellum=of("in_flagellum"),
     )

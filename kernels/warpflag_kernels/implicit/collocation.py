@@ -35,8 +35,7 @@ from warpflag_kernels.contact import contact_list
 from warpflag_kernels.implicit import block_band, contact_solve, delassus
 from warpflag_kernels.rod import chain_chart
 from warpflag_kernels.rod import comoving_chart as chart_stage
-from warpflag_kernels.rod.comoving_chart import vec6d
-from warpflag_kernels.stepping import step_control
+from warpflag_kernels.stepping import accuracy, balance, step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
@@ -95,7 +94,8 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def kernels(p: Precision) -> SimpleNamespace:
+def kernels(p: Precision, balanced: bool) -> SimpleNamespace:
+    """The kernels; those of a model whose steps are asked for their power balance, or not."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Implicit = chart_stage.struct(p), struct(p)
@@ -104,12 +104,17 @@ def kernels(p: Precision) -> SimpleNamespace:
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     drag = block_band.functions(p).drag
     f = step_control.functions(p, independent=True)
-    allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
+    allowed, asked, accept, next_step, smallest = f.allowed, f.asked, f.accept, f.next_step, f.smallest
+    add_estimate = accuracy.functions(independent=True).add
     advanced = clock.functions().advanced
-    module = p.module("collocation")
+    module = p.module("collocation", "balanced" if balanced else "")
+    Balance, keeps, counted = balance.struct(p), balance.functions(p).kept, balance.functions(p).count
+    round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
     theta_inside, per_predictor = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(ERROR_PER_PREDICTOR))
     no_fault = wp.constant(wp.int32(NO_FAULT))
-    unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
+    unsolved, inaccurate, unbalanced = (
+        wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE)
+    )
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
 
     @wp.kernel(module=module)
@@ -269,14 +274,8 @@ def kernels(p: Precision) -> SimpleNamespace:
             total.body[c] = b
             remaining.body[c] = b - ahead * last.body[c] - found.body[c]
             chart.commit[c] = 1  # the guards check this pose
-            chart.body_increment[c] = vec6d(
-                wp.float64(b[0]),
-                wp.float64(b[1]),
-                wp.float64(b[2]),
-                wp.float64(b[3]),
-                wp.float64(b[4]),
-                wp.float64(b[5]),
-            )
+            for r in range(6):
+                chart.body_increment[c][r] = wp.float64(b[r])
 
     @wp.kernel(module=module)
     def decide(
@@ -292,6 +291,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         control: Control,
         steps: StepControl,
         imp: Implicit,
+        powers: Balance,
     ):
         c = wp.tid()
         if state.active[c] == 0:
@@ -311,7 +311,20 @@ def kernels(p: Precision) -> SimpleNamespace:
         error = per_predictor * truncated * predictor_error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
-        if accept(steps, c, dt, error, wp.float64(0.0), sound, imp.history[c] == 2):
+        kept = bool(True)
+        energy = wp.float64(0.0)
+        lasts = bool(False)
+        if wp.static(balanced):
+            kept, energy = keeps(model, powers, c, dt, wp.max(round_off, asked(steps, c, dt)))
+            if sound and powers.known[c] != 0:
+                lasts = counted(powers, c, kept)
+            sound = sound and kept
+        known = imp.history[c] == 2
+        if accept(steps, c, dt, error, wp.float64(0.0), sound, known):
+            if known and add_estimate(steps.achieved, c, dt, error, advanced(control, c), steps.shortest[c]):
+                control.fault[c] = inaccurate
+            powers.stored[c] = energy
+            powers.known[c] = 1
             imp.accepted[c] = 1
             imp.trust[c] = wp.float64(0.0)
             if predictor_error < predicted_displacement:
@@ -324,10 +337,12 @@ def kernels(p: Precision) -> SimpleNamespace:
             return
         imp.accepted[c] = 0
         chart.commit[c] = 0
-        if dt > smallest:
+        if lasts:
+            control.fault[c] = unbalanced
+        elif dt > smallest:
             control.fault[c] = no_fault
         elif control.fault[c] == no_fault:
-            control.fault[c] = unsolved
+            control.fault[c] = wp.where(kept, unsolved, unbalanced)
 
     @wp.kernel(module=module)
     def keep_elements(

@@ -28,7 +28,8 @@ def functions(p: Precision) -> SimpleNamespace:
     """Device functions of the elastic term, and `joint`, the energy gradients of one joint."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    twist, angle = rotations.functions(p).twist, rotations.functions(p).angle
+    r = rotations.functions(p)
+    twist, angle, joint_strain = r.twist, r.angle, r.joint_strain
 
     module = p.module("elastic_functions")
 
@@ -92,8 +93,44 @@ def functions(p: Precision) -> SimpleNamespace:
     def on_second(model: Model, state: State, e: wp.int32, k: wp.int32, force: vec3):
         return force - gradient(model, state, e, k)
 
+    @wp.func(module=module)
+    def energies(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Bending, twist and stretching energy of segment e and the joint after it [pN um]."""
+        first = model.first_node[k]
+        h = model.rod.segment_length[k]
+        bend = real(0.0)
+        twist = real(0.0)
+        stretch = real(0.0)
+        if e > first:
+            strain = state.pose.length[e] / h - real(1.0)
+            stretch = real(0.5) * model.rod.stretching_stiffness[k] * h * strain * strain
+        if e + 1 < model.first_node[k + 1]:
+            w = joint_strain(
+                state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
+            )
+            if e == first and model.rod.hook_rigidity[k] == real(0.0):
+                twist = real(0.0)
+            elif e == first:
+                twist = real(0.5) * model.rod.hook_rigidity[k] / h * w[2] * w[2]
+            else:
+                d = w - model.rod.rest_strain[e]
+                bend = real(0.5) * model.rod.bending_rigidity[k] / h * (d[0] * d[0] + d[1] * d[1])
+                twist = real(0.5) * model.rod.twist_rigidity[k] / h * d[2] * d[2]
+        return vec3(bend, twist, stretch)
+
+    @wp.func(module=module)
+    def energy(model: Model, state: State, e: wp.int32, k: wp.int32, energy: wp.float64):
+        x = energies(model, state, e, k)
+        return energy + wp.float64(x[0]) + wp.float64(x[1]) + wp.float64(x[2])
+
     return SimpleNamespace(
-        joint=joint, in_flagellum=in_flagellum, on_first=on_first, on_second=on_second, on_spin=_on_spin(p)
+        joint=joint,
+        energies=energies,
+        energy=energy,
+        in_flagellum=in_flagellum,
+        on_first=on_first,
+        on_second=on_second,
+        on_spin=_on_spin(p),
     )
 
 
@@ -149,9 +186,9 @@ def _bearing_functions(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
-    real, vec3 = p.real, p.vec3
+    vec3 = p.vec3
     Model, State = structs(p).Model, structs(p).State
-    joint, joint_strain = functions(p).joint, rotations.functions(p).joint_strain
+    joint, energies = functions(p).joint, functions(p).energies
 
     @wp.kernel(module=p.module("elastic"))
     def joint_gradients(
@@ -179,27 +216,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[model.cell_of[e]] == 0:
             return
         k = model.flagellum_of[e]
-        first = model.first_node[k]
-        h = model.rod.segment_length[k]
-        bend = real(0.0)
-        twist = real(0.0)
-        stretch = real(0.0)
-        if e > first:
-            strain = state.pose.length[e] / h - real(1.0)
-            stretch = real(0.5) * model.rod.stretching_stiffness[k] * h * strain * strain
-        if e + 1 < model.first_node[k + 1]:
-            w = joint_strain(
-                state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
-            )
-            if e == first and model.rod.hook_rigidity[k] == real(0.0):
-                twist = real(0.0)
-            elif e == first:
-                twist = real(0.5) * model.rod.hook_rigidity[k] / h * w[2] * w[2]
-            else:
-                d = w - model.rod.rest_strain[e]
-                bend = real(0.5) * model.rod.bending_rigidity[k] / h * (d[0] * d[0] + d[1] * d[1])
-                twist = real(0.5) * model.rod.twist_rigidity[k] / h * d[2] * d[2]
-        energy_out[e] = vec3(bend, twist, stretch)
+        energy_out[e] = energies(model, state, e, k)
 
     return SimpleNamespace(joint_gradients=joint_gradients, energy=energy)
 

@@ -82,7 +82,7 @@ def functions(p: Precision) -> SimpleNamespace:
     def twist_angle(t: vec3, u: vec3, a1: vec3, b1: vec3):
         """Angle from a1, transported from t onto u, to b1 [rad]."""
         s, c = twist(t, u, a1, b1)
-        return wp.atan2(s, c)
+        return angle(s, c)
 
     @wp.func(module=module)
     def joint_strain(t: vec3, u: vec3, a1: vec3, b1: vec3):

@@ -24,9 +24,7 @@ from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
 
 LARGEST_STRAIN = 0.05  # of a segment; 50 pN at the default stretching stiffness
-LARGEST_TWIST = (
-    0.5 * math.pi
-)  # per joint [rad]: beyond a quarter of a turn the discrete twist no longer resolves the rod
+LARGEST_TWIST = 0.5 * math.pi  # per joint [rad]: beyond a quarter of a turn the discrete twist does not resolve the rod
 SMALLEST_FOLD = 0.03  # of 1 + t.u: neighbours at more than 166 degrees; the curvature 2 tan(angle/2) diverges at 180
 LARGEST_TURN = 2.0  # of a motor in one step [rad]: angles of a step are added up, and are ambiguous from pi on
 CROSSED = 0.05  # distance at which crossing centre lines count as touching [sigma]
@@ -43,6 +41,9 @@ class Fault(IntEnum):
     FOLD = 4
     UNSOLVED = 5
     TURN = 6
+    ACCURACY = 7
+    BALANCE = 8
+    UNSTABLE = 9
 
 
 def encode(kind: Fault) -> int:
@@ -139,10 +140,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             return
         if e == model.first_node[k] and wp.abs(chart.increment[e][3]) > largest_turn:
             wp.atomic_min(control.fault, c, turned + e)
-        if (
-            e > model.first_node[k]
-            and wp.abs(state.pose.length[e] / model.rod.segment_length[k] - real(1.0)) > largest_strain
-        ):
+        strain = state.pose.length[e] / model.rod.segment_length[k] - real(1.0)
+        if e > model.first_node[k] and wp.abs(strain) > largest_strain:
             wp.atomic_min(control.fault, c, strained + e)
         free_end = e == model.first_node[k] and model.rod.hook_rigidity[k] == real(0.0)
         if e + 1 < model.first_node[k + 1] and not free_end:
@@ -263,12 +262,25 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     ):
         e = wp.tid()
         c = model.cell_of[e]
-        if state.active[c] == 0 or chart.commit[c] == 0 or not due(control, guard, chart, c):
-            return  # a start has no earlier check
+        if state.active[c] == 0 or not due(control, guard, chart, c):
+            return
         k = model.flagellum_of[e]
         if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
             return
         touch = touching * model.steric.diameter[c]
+        if chart.commit[c] == 0:  # a start has no earlier check: no pair may touch already
+            p1 = state.pose.position[e - 1]
+            other = k + 1
+            while other < model.first_flagellum[c + 1]:
+                j = model.first_node[other] + 1
+                while j < model.first_node[other + 1]:
+                    p2 = state.pose.position[j - 1]
+                    if distance(p1, state.pose.position[e] - p1, p2, state.pose.position[j] - p2) < touch:
+                        wp.atomic_min(control.fault, c, crossing + e)
+                    away = wp.length(middle(state, e) - middle(state, j)) - touch
+                    j = next_near(guard.longest[other], j, away, real(0.5) * state.pose.length[e])
+                other += 1
+            return
         moved = farthest(model, guard.moved, c)
         # A pair that can have met between the two checks is in the list of contacts, or in the neighbour lists, if no
         # node has been too far from its position when the list was made.
@@ -301,8 +313,8 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             while j < end:
                 if met(state, guard, e, j, moved, touch):
                     wp.atomic_min(control.fault, c, crossing + e)
-                distance = wp.length(middle(state, e) - middle(state, j))
-                j = next_near(guard.longest[other], j, distance, reach)
+                away = wp.length(middle(state, e) - middle(state, j))
+                j = next_near(guard.longest[other], j, away, reach)
             other += 1
 
     @wp.kernel(module=module)

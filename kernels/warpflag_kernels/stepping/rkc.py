@@ -24,8 +24,10 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
+from warpflag_kernels.stepping import accuracy, step_control
 from warpflag_kernels.stepping import chebyshev as chebyshev_polynomials
-from warpflag_kernels.stepping import step_control
+from warpflag_kernels.stepping.health import Fault, encode
+from warpflag_kernels.stepping.rkc_arrays import struct
 from warpflag_kernels.stepping.step_control import StepControl
 
 DAMPING = 2.0 / 13.0  # of the stability polynomial, as in the paper above
@@ -45,58 +47,13 @@ MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unsta
 
 
 @functools.cache
-def struct(p: Precision) -> Any:
-    """The struct `Rkc`: earlier stages of a step, the probe, and the stage counter of every cell."""
-    real, vec4 = p.real, p.vec4
-
-    @wp.struct
-    class Rkc:
-        previous: wp.array(dtype=vec4)  # [E], Y_(j-1)
-        before_previous: wp.array(dtype=vec4)  # [E], Y_(j-2)
-        start_rate: wp.array(dtype=vec4)  # [E], F_0
-        probe: wp.array(dtype=vec4)  # [E], direction of the power method, any length
-        body_previous: wp.array(dtype=vec6d)  # [C]
-        body_before_previous: wp.array(dtype=vec6d)  # [C]
-        body_start_rate: wp.array(dtype=vec6d)  # [C]
-        stage: wp.array(dtype=wp.int32)  # [C]
-        stages: wp.array(dtype=wp.int32)  # [C], s; fixed to 1 for Euler
-        probes_left: wp.array(dtype=wp.int32)  # [C], before the next step starts
-        probe_norm: wp.array(dtype=wp.float64)  # [C]
-        probe_sum: wp.array(dtype=wp.float64)  # [K], squared norm of the flagellum's part
-        error: wp.array(dtype=real)  # [K], largest node error estimate [um]
-        noise: wp.array(dtype=real)  # [K], below which it is lost in round-off [um]
-        spectral_radius: wp.array(dtype=wp.float64)  # [C] [1/s]
-        coefficients: wp.array(dtype=wp.vec4d)  # [C]: mu, nu, and m dt, g dt [s]
-        evaluations: wp.array(dtype=wp.int32)  # [C], right-hand sides so far
-
-    return Rkc
-
-
-def allocate(model: DeviceModel) -> Any:
-    """Arrays of the struct `Rkc`, zero."""
-    p, device = model.precision, model.device
-    cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
-
-    def zeros(count: int, dtype: Any) -> wp.array:
-        return wp.zeros(count, dtype=dtype, device=device)
-
-    r = struct(p)()
-    r.previous, r.before_previous, r.start_rate, r.probe = (zeros(elements, p.vec4) for _ in range(4))
-    r.body_previous, r.body_before_previous, r.body_start_rate = (zeros(cells, vec6d) for _ in range(3))
-    r.stage, r.stages, r.probes_left, r.evaluations = (zeros(cells, wp.int32) for _ in range(4))
-    r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
-    r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
-    r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
-    return r
-
-
-@functools.cache
 def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
+    add_estimate = accuracy.functions(independent=False).add
     advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
     chebyshev, weight = polynomials.chebyshev, polynomials.weight
     module = p.module("euler" if euler else "rkc")
@@ -106,16 +63,26 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
     epsilon = wp.constant(real(EPSILON[p.name]))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
-    no_fault = wp.constant(wp.int32(NO_FAULT))
+    no_fault, inaccurate, unstable = (
+        wp.constant(wp.int32(x)) for x in (NO_FAULT, encode(Fault.ACCURACY), encode(Fault.UNSTABLE))
+    )
+
+    @wp.func(module=module)
+    def outgrown(control: Control, rkc: Rkc, c: wp.int32):
+        """Whether the last fixed step ended where its stages are too few, or the next one needs more than there are."""
+        s = wp.float64(rkc.stages[c])
+        ended = rkc.spectral_radius[c] * control.step[c] > (s * s - wp.float64(1.0)) / stage_factor
+        next = stage_factor * safety * rkc.spectral_radius[c] * control.longest_step[c]
+        return (control.steps[c] > 0 and ended) or next > most_stages * most_stages
 
     @wp.kernel(module=module)
     def schedule(
         # Model:
         model: Model,
         # State:
-        state: State,
         steps: StepControl,
         # Out:
+        state: State,
         control: Control,
         rkc: Rkc,
         chart: Chart,
@@ -127,6 +94,11 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
         one = wp.float64(1.0)
         j = rkc.stage[c]
         if j == 1:
+            if wp.static(not euler) and steps.error_rate[c] <= zero and outgrown(control, rkc, c):
+                control.fault[c] = unstable
+                state.active[c] = 0
+                wp.atomic_sub(control.unfinished, 0, 1)
+                return
             left = control.target[c] - control.time[c]
             if steps.error_rate[c] > zero:
                 control.step[c] = next_step(steps, c, control.longest_step[c], left)
@@ -279,7 +251,11 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             noise = wp.max(noise, wp.float64(rkc.noise[k]))
             k += 1
         sound = control.fault[c] == no_fault and wp.isfinite(error)
-        if not accept(steps, c, control.step[c], error, noise, sound, True) and control.step[c] > smallest:
+        fixed = steps.error_rate[c] <= wp.float64(0.0)
+        if accept(steps, c, control.step[c], error, noise, sound, True):
+            if add_estimate(steps.achieved, c, control.step[c], error, advanced(control, c), steps.shortest[c]):
+                control.fault[c] = inaccurate
+        elif not fixed and control.step[c] > smallest:
             control.fault[c] = no_fault
             chart.commit[c] = 0
             chart.at_start[c] = 0
@@ -375,7 +351,7 @@ def begin_pass(
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
     kernels = _kernels(model.precision, euler)
-    inputs = [model.data, state.data, steps, control, rkc, chart]
+    inputs = [model.data, steps, state.data, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
     wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)

@@ -18,8 +18,9 @@ import warp as wp
 
 from warpflag_kernels.base.clock import STEP_TOLERANCE
 from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.stepping import accuracy
+from warpflag_kernels.stepping.accuracy import SPAN, Achieved
 
-SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
 # Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41.
 LARGEST_GROWTH = 2.0
 REJECTED = 25.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
@@ -29,7 +30,9 @@ FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below t
 # If halving a rejected step leaves more than this fraction of its error, the velocity itself jumps (smooth: 1/8), and
 # shorter steps do not help.
 JUMP = 0.25
-SHORTEST_STEP = 2.0e-8  # shortest step that an error estimate asks for [s]; only one that can't be solved goes below
+# Shortest step that an error estimate asks for, in water [s]; only one that can't be solved goes below. Thinner fluids,
+# in which everything is faster, have a shorter one.
+SHORTEST_STEP = 2.0e-8
 ROUND_OFF = {"float64": 1.0e-14, "float32": 3.0e-7}  # least error estimate [um]: round-off of a position of some um
 SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be solved here ends the cell's run
 
@@ -44,17 +47,27 @@ class StepControl:
     error_time: wp.array(dtype=wp.float64)  # the same of dt, the total weight [s]
     rejected: wp.array(dtype=wp.int32)  # steps rejected so far
     rejected_error: wp.array(dtype=wp.float64)  # estimate of the last attempt if that was rejected for it, else 0 [um]
+    shortest: wp.array(dtype=wp.float64)  # that an estimate asks for [s]
+    achieved: Achieved
 
 
-def allocate(accuracies: Sequence[float], device: Any) -> StepControl:
+def allocate(
+    accuracies: Sequence[float], fixed: Sequence[bool], stopping: Sequence[bool], pace: Sequence[float], device: Any
+) -> StepControl:
     """The struct `StepControl` of every cell.
 
     Args:
-        accuracies: node error per simulated time [um/ms], one per cell; 0 for a fixed step.
+        accuracies: node error per simulated time [um/ms], one per cell.
+        fixed: whether a cell's steps are fixed, and the accuracy is only what its estimates are compared with.
+        stopping: whether a cell with controlled steps is stopped where its estimates are far above the accuracy.
+        pace: of the scene's motion, over that in water; above 1 steps may be shorter.
         device: Warp's device.
     """
     cells, c = len(accuracies), StepControl()
-    c.error_rate = wp.array([a * 1e3 for a in accuracies], dtype=wp.float64, device=device)
+    rates = [0.0 if f else a * 1e3 for a, f in zip(accuracies, fixed, strict=True)]
+    c.error_rate = wp.array(rates, dtype=wp.float64, device=device)
+    c.shortest = wp.array([SHORTEST_STEP / max(x, 1.0) for x in pace], dtype=wp.float64, device=device)
+    c.achieved = accuracy.allocate(accuracies, [s and not f for s, f in zip(stopping, fixed, strict=True)], device)
     c.wanted_step, c.error_sum, c.error_time, c.rejected_error = (
         wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
     )
@@ -74,12 +87,17 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     forgotten = wp.constant(wp.float64(FORGOTTEN * MEMORY))
     round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
-    jump, shortest = (wp.constant(wp.float64(x)) for x in (JUMP, SHORTEST_STEP))
+    jump = wp.constant(wp.float64(JUMP))
 
     @wp.func(module=module)
     def allowed(control: StepControl, c: wp.int32, dt: wp.float64):
         """Error that a step may make [um]."""
         return control.error_rate[c] * scale * wp.pow(dt, power)
+
+    @wp.func(module=module)
+    def asked(control: StepControl, c: wp.int32, dt: wp.float64):
+        """Error that a step may make by the accuracy, which fixed steps need not keep [um]."""
+        return control.achieved.asked[c] * scale * wp.pow(dt, power)
 
     @wp.func(module=module)
     def accept(
@@ -106,7 +124,9 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             # A shorter step is no better where the velocity jumps, as at contacts of parallel segments: accept.
             before = control.rejected_error[c]
             jumps = before > wp.float64(0.0) and error > jump * before
-            good = sound and (error < rejection * most or jumps or dt <= shortest)
+            good = sound and (error < rejection * most or jumps or dt <= control.shortest[c])
+            if good and dt <= control.shortest[c] and error > most:
+                control.achieved.at_shortest[c] += 1
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
                 level = wp.log(bound / (dt * dt * dt))
@@ -127,7 +147,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
                     best = wp.pow(safety * scale * control.error_rate[c] / level, root)
-                    factor = wp.min(growth, wp.max(best, shortest) / dt)
+                    factor = wp.min(growth, wp.max(best, control.shortest[c]) / dt)
         if good:
             control.rejected_error[c] = wp.float64(0.0)
             # A step shortened to end on the target does not shorten the one wanted after it.
@@ -152,4 +172,4 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             dt = wp.float64(0.5) * left
         return dt
 
-    return SimpleNamespace(allowed=allowed, accept=accept, next_step=next_step, smallest=smallest)
+    return SimpleNamespace(allowed=allowed, asked=asked, accept=accept, next_step=next_step, smallest=smallest)

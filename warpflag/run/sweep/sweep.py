@@ -13,11 +13,11 @@ from typing import Any
 from warpflag.base.device import start_warp
 from warpflag.base.progress import Progress
 from warpflag.model.build import switches_of
+from warpflag.model.starts import Starts
 from warpflag.run.lock import SWEEP_NAME, Lock, LockedError
 from warpflag.run.member import Outcome
 from warpflag.run.run import begun_at_checkpoint
 from warpflag.run.run_directory import RunError, check_same_scene, claim_directory, write_whole
-from warpflag.run.starts import Starts
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.sweep import table
 from warpflag.run.sweep.plan import BASE_NAME, BadMembers, Member, Sweep, read

@@ -1,0 +1,136 @@
+"""What accuracy a run has kept: the error estimates of its steps added up on the device, per cell.
+
+A step of dt may err by what `step_control` says, which grows as dt^p, p = 1 for errors of equal sign and 1/2 for
+independent ones. With r the estimate over that, the errors of steps add up to the share
+
+    [sum of dt r^(1/p) / time]^p
+
+of what was asked for the same time: the mean of r for p = 1, its root mean square for p = 1/2. It is kept for the whole
+run, for windows of `WINDOW`, of which the worst is remembered, and for the present millisecond, in which a run that has
+erred by `BEYOND` times what a whole millisecond may is stopped, unless its scene says otherwise.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
+WINDOW = 1.0e-4  # time over which the worst estimate is taken [s]: some ten steps and more
+# Steps of the shortest length that are not counted after the start of a scene, 1 us in water: what the start leaves
+# stretched and pressed relaxes then, and estimates see that as error.
+BEGIN = 50.0
+BEYOND = 10.0  # estimate over what was asked at which a run is stopped
+
+
+@wp.struct
+class Achieved:
+    """Per cell [C]; sums are of dt r^(1/p) [s]."""
+
+    asked: wp.array(dtype=wp.float64)  # error per simulated time [um/s]
+    limit: wp.array(dtype=wp.float64)  # estimate over asked at which the cell is stopped; 0: never
+    total: wp.array(dtype=wp.float64)  # sum since the start
+    total_time: wp.array(dtype=wp.float64)  # time of the steps in it [s]
+    window: wp.array(dtype=wp.float64)  # sum of the present window
+    window_time: wp.array(dtype=wp.float64)  # [s]
+    worst: wp.array(dtype=wp.float64)  # estimate over asked of the worst window
+    worst_end: wp.array(dtype=wp.float64)  # its end [s]
+    span: wp.array(dtype=wp.float64)  # sum of the present `SPAN`
+    span_time: wp.array(dtype=wp.float64)  # [s]
+    at_shortest: wp.array(dtype=wp.int32)  # steps that the estimate wanted shorter than the shortest that it may
+
+
+SUMS = ("total", "total_time", "window", "window_time", "worst", "worst_end", "span", "span_time")
+"""What goes on from step to step, beside `at_shortest`."""
+
+
+def allocate(accuracies: Sequence[float], stopping: Sequence[bool], device: Any) -> Achieved:
+    """The struct `Achieved`, nothing added up yet.
+
+    Args:
+        accuracies: asked for [um/ms], one per cell.
+        stopping: whether a cell is stopped where its estimate is beyond the limit.
+        device: Warp's device.
+    """
+    a = Achieved()
+    a.asked = wp.array(np.array(accuracies) * 1e3, dtype=wp.float64, device=device)
+    a.limit = wp.array(np.where(stopping, BEYOND, 0.0), dtype=wp.float64, device=device)
+    for name in SUMS:
+        setattr(a, name, wp.zeros(len(accuracies), dtype=wp.float64, device=device))
+    a.at_shortest = wp.zeros(len(accuracies), dtype=wp.int32, device=device)
+    return a
+
+
+@functools.cache
+def functions(independent: bool) -> SimpleNamespace:
+    """Device function `add` for errors that are independent from step to step, or of equal sign."""
+    name = "independent" if independent else "systematic"
+    module = wp.get_module(f"warpflag_kernels.accuracy_{name}")
+    exponent = 0.5 if independent else 1.0
+    scale, power = wp.constant(wp.float64(SPAN ** (1.0 - exponent))), wp.constant(wp.float64(exponent))
+    span, window, begin = (wp.constant(wp.float64(x)) for x in (SPAN, WINDOW, BEGIN))
+
+    @wp.func(module=module)
+    def add(a: Achieved, c: wp.int32, dt: wp.float64, error: wp.float64, time: wp.float64, shortest: wp.float64):
+        """Counts the estimate of an accepted step [um]; whether that is beyond the limit.
+
+        Args:
+            time: at the end of the step [s].
+            shortest: step that an estimate asks for [s].
+        """
+        zero = wp.float64(0.0)
+        if time < begin * shortest:
+            return False
+        share = error / (a.asked[c] * scale * wp.pow(dt, power))
+        sum = dt * share
+        if wp.static(independent):
+            sum = dt * share * share
+        a.total[c] += sum
+        a.total_time[c] += dt
+        a.window[c] += sum
+        a.window_time[c] += dt
+        if a.window_time[c] >= window:
+            found = wp.pow(a.window[c] / a.window_time[c], power)
+            if found > a.worst[c]:
+                a.worst[c] = found
+                a.worst_end[c] = time
+            a.window[c] = zero
+            a.window_time[c] = zero
+        a.span[c] += sum
+        a.span_time[c] += dt
+        beyond = a.limit[c] > zero and wp.pow(a.span[c] / span, power) > a.limit[c]
+        if a.span_time[c] >= span:
+            a.span[c] = zero
+            a.span_time[c] = zero
+        return beyond
+
+    return SimpleNamespace(add=add)
+
+
+def estimates(sums: Mapping[str, float], independent: bool) -> tuple[float, float] | None:
+    """Estimates over what was asked: of the whole run, and of its worst window, the present one included.
+
+    Args:
+        sums: of a cell by name, as in `Achieved`.
+        independent: as in `functions`.
+
+    Returns:
+        The two; None where no step has an estimate.
+    """
+    power = 0.5 if independent else 1.0
+    if sums["total_time"] <= 0.0:
+        return None
+    worst = sums["worst"]
+    # A window that has just begun says little; a run shorter than one has no other.
+    if sums["window_time"] > 0.5 * WINDOW or (worst == 0.0 and sums["window_time"] > 0.0):
+        worst = max(worst, (sums["window"] / sums["window_time"]) ** power)
+    return (sums["total"] / sums["total_time"]) ** power, worst
+
+
+def last_span(sums: Mapping[str, float], independent: bool) -> float:
+    """Estimate over what was asked of the present millisecond, as far as it goes but no less than `WINDOW` of it."""
+    power = 0.5 if independent else 1.0
+    return (sums["span"] / max(sums["span_time"], WINDOW)) ** power

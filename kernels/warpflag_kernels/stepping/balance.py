@@ -1,0 +1,234 @@
+"""The power balance of a step: what the motors and all else from outside put in is dissipated or stored.
+
+A step takes the displacement x. With the energy U of the terms that store some (`Term.functions`, `energy`) and the
+forces F of all others at the pose that the second iteration evaluates,
+
+    dissipated = F x - (U after - U before).
+
+The left side is never negative, and where the velocities V there are those of the step, it is F_all V dt, F_all the sum
+of all forces. Both are asked of every step, to within what an error of the size that the step may make does against the
+forces: |F_all| times that error. An unstable step gains energy that nothing puts in, long before any value looks
+wrong. A term that states no energy counts as a force from outside, so none can be forgotten.
+
+The first step after a start has no energy before it and is not judged.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.rod import chain_chart
+
+# What a step may dissipate over the power of its velocities: 1.2 at most in sound runs. Velocities of stiff modes are
+# those before the step's last correction, so they may exceed what is dissipated by far.
+MOST_DISSIPATED = 2.0
+# A violation counts as WEIGHT steps that keep the balance: where more than one step in ten violates it, the count
+# grows, and beyond LASTING, some twenty violations more than that, the cell is stopped.
+WEIGHT = 9
+LASTING = 200
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Balance`."""
+    vec4, vec6 = p.vec4, chain_chart.types(p).vec6
+
+    @wp.struct
+    class Balance:
+        node: wp.array(dtype=vec4)  # [E], force [pN] and spin torque [pN um] of the terms that store no energy
+        body: wp.array(dtype=vec6)  # [K], their force and torque on the body
+        power: wp.array(dtype=wp.float64)  # [K], of all forces on all velocities [pN um/s]
+        load: wp.array(dtype=wp.float64)  # [K], sum of the sizes of the nodes' forces [pN]
+        work: wp.array(dtype=wp.float64)  # [K], of the terms that store no energy [pN um]
+        energy: wp.array(dtype=wp.float64)  # [K], after the step [pN um]
+        stored: wp.array(dtype=wp.float64)  # [C], before it [pN um]
+        known: wp.array(dtype=wp.int32)  # [C], 1: `stored` is that of the present state
+        refused: wp.array(dtype=wp.int32)  # [C], steps that violated the balance so far
+        lasting: wp.array(dtype=wp.int32)  # [C], WEIGHT times these, less the steps that have kept it
+
+    return Balance
+
+
+MEMORY = ("stored", "known", "refused", "lasting")
+"""What goes on from step to step."""
+
+
+def holds(model: DeviceModel) -> bool:
+    """Whether the balance can be asked of the model's steps: every term is a force or states its energy."""
+    return all(term.balanced for term in model.terms)
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Balance`, zero; where the balance does not hold, those of single elements are empty."""
+    p, device = model.precision, model.device
+    b = struct(p)()
+    b.node = wp.zeros(model.element_count, dtype=p.vec4, device=device)
+    b.body = wp.zeros(model.flagellum_count, dtype=chain_chart.types(p).vec6, device=device)
+    for name in ("power", "load", "work", "energy"):
+        setattr(b, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
+    b.stored = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
+    for name in ("known", "refused", "lasting"):
+        setattr(b, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
+    return b
+
+
+@functools.cache
+def _kernels(p: Precision, storing: tuple[Term, ...]) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    Model, State, Balance, vec6 = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).vec6
+    Increment = chain_chart.types(p).Increment
+    f = combined(p, storing)
+    on_first, on_second, on_node, on_spin, on_body = f.on_first, f.on_second, f.on_node, f.on_spin, f.on_body
+    energy_of = f.energy
+    module = p.module("balance", variant(storing))
+
+    @wp.kernel(module=module)
+    def gather(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        balance: Balance,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        end = model.first_node[k + 1]
+        c = model.cell_of[first]
+        if state.active[c] == 0:
+            return
+        zero = real(0.0)
+        mobility = model.drag.spin_mobility[k]
+        torque = state.spin_torque[first]
+        power = mobility * torque * torque
+        load = zero
+        anchor = on_node(model, state, first, k, vec3(zero))
+        # What is left of a node's force waits for the segment after it.
+        left = state.force[first] - anchor
+        turn = torque - on_spin(model, state, first, k, zero)
+        e = first + 1
+        while e < end:
+            before = on_first(model, state, e, k, vec3(zero))
+            after = on_second(model, state, e, k, vec3(zero))
+            if e == first + 1:
+                anchor += before
+            d = left - before
+            balance.node[e - 1] = vec4(d[0], d[1], d[2], turn)
+            force = state.force[e]
+            torque = state.spin_torque[e]
+            power += wp.dot(force, state.velocity[e]) + mobility * torque * torque
+            load += wp.length(force)
+            left = force - on_node(model, state, e, k, after)
+            turn = torque - on_spin(model, state, e, k, zero)
+            e += 1
+        balance.node[end - 1] = vec4(left[0], left[1], left[2], turn)
+        stored, turned = on_body(model, state, k, anchor, wp.cross(state.pose.position[first], anchor))
+        force = state.flagellum_force[k]
+        torque3 = state.flagellum_torque[k]
+        power += wp.dot(force, state.body_velocity[c]) + wp.dot(torque3, state.body_spin[c])
+        d = force - stored
+        t = torque3 - turned
+        balance.body[k] = vec6(d[0], d[1], d[2], t[0], t[1], t[2])
+        balance.power[k] = wp.float64(power)
+        balance.load[k] = wp.float64(load)
+
+    @wp.kernel(module=module)
+    def weigh(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        total: Increment,
+        # Out:
+        balance: Balance,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0:
+            return
+        work = wp.dot(balance.body[k], total.body[c])
+        energy = wp.float64(0.0)
+        e = first
+        while e < model.first_node[k + 1]:
+            d = balance.node[e]
+            x = total.node[e]
+            if e > first:
+                work += wp.dot(d, x)
+            else:
+                work += d[3] * x[3]
+            energy = energy_of(model, state, e, k, energy)
+            e += 1
+        balance.work[k] = wp.float64(work)
+        balance.energy[k] = energy
+
+    return SimpleNamespace(gather=gather, weigh=weigh)
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions `kept`, whether a step keeps the balance, and `count`, of steps that do not."""
+    Model, Balance = structs(p).Model, struct(p)
+    module = p.module("balance_functions")
+    most = wp.constant(wp.float64(MOST_DISSIPATED))
+    weight, lasting = wp.constant(wp.int32(WEIGHT)), wp.constant(wp.int32(LASTING))
+
+    @wp.func(module=module)
+    def kept(model: Model, balance: Balance, c: wp.int32, dt: wp.float64, error: wp.float64):
+        """Whether a step of dt, which may err by `error` [um], keeps the balance; and the energy after it [pN um]."""
+        zero = wp.float64(0.0)
+        work = zero
+        energy = zero
+        power = zero
+        load = zero
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            work += balance.work[k]
+            energy += balance.energy[k]
+            power += balance.power[k]
+            load += balance.load[k]
+            k += 1
+        within = load * error
+        dissipated = work - (energy - balance.stored[c])
+        good = dissipated > -within and dissipated < most * power * dt + within
+        return good or balance.known[c] == 0, energy
+
+    @wp.func(module=module)
+    def count(balance: Balance, c: wp.int32, good: wp.bool):
+        """Counts a judged step; whether violations have gone on for too long."""
+        if good:
+            balance.lasting[c] = wp.max(balance.lasting[c] - 1, 0)
+            return False
+        balance.refused[c] += 1
+        balance.lasting[c] += weight
+        return balance.lasting[c] > lasting
+
+    return SimpleNamespace(kept=kept, count=count)
+
+
+def storing(model: DeviceModel) -> tuple[Term, ...]:
+    """The model's terms that store energy."""
+    return tuple(term for term in model.terms if hasattr(term.functions(model.precision), "energy"))
+
+
+def gather(model: DeviceModel, state: DeviceState, balance: Any) -> None:
+    """Takes up forces and velocities of the present pose, where they have just been evaluated."""
+    kernel = _kernels(model.precision, storing(model)).gather
+    wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, balance], device=model.device)
+
+
+def weigh(model: DeviceModel, state: DeviceState, total: Any, balance: Any) -> None:
+    """Work of these forces on a step's increment, and the energy at its end, the present pose.
+
+    Args:
+        model, state: of the batch.
+        total: the whole step, struct `Increment`.
+        balance: struct `Balance`.
+    """
+    kernel = _kernels(model.precision, storing(model)).weigh
+    wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, total, balance], device=model.device)

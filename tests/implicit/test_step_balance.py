@@ -1,0 +1,90 @@
+"""The power balance of every implicit step: its parts against known values, and that it sees an unstable stepper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from warpflag_kernels.stepping.health import Fault
+
+from tests.helpers import cell, touching_cell
+from warpflag.run.simulation import NumericalError, Simulation
+from warpflag.scene import Scene, with_values
+
+# Of energy and work, relative: float32 has seven digits, and differences of positions of some um.
+TOLERANCE = {"float64": 1e-9, "float32": 2e-3}
+
+
+def sums(sim: Simulation, name: str) -> float:
+    return float(getattr(sim.stepper.balance, name).numpy().sum())
+
+
+def test_energy_and_work_of_a_step_are_those_of_the_cell(device, precision):
+    """A body held fast, no contacts: the motor's work is torque times angle, as the chart counts it."""
+    values = {"numerics.stepper": "implicit", "body.anchored": True, "body.contact": False, "steric.enabled": False}
+    sim = Simulation(cell({**values, "flagellum.0.torque": 2.0, "flagellum.1.torque": -1.0}, precision), device=device)
+    sim.advance(1e-4)
+    for until in (1.01e-4, 1.05e-4):  # a step each
+        before, steps = sim.cell_state(), sim.steps[0]
+        sim.advance(until)
+        after = sim.cell_state()
+        if sim.steps[0] == steps + 1:
+            turned = after.motor_angle - before.motor_angle
+            assert sums(sim, "work") == pytest.approx(float(turned @ [2.0, -1.0]), rel=TOLERANCE[precision])
+        energy = float(after.elastic_energy.sum())
+        assert sums(sim, "energy") == pytest.approx(energy, rel=TOLERANCE[precision])
+        assert sim.stepper.balance.stored.numpy()[0] == pytest.approx(energy, rel=TOLERANCE[precision])
+    assert sums(sim, "refused") == 0
+
+
+@pytest.mark.parametrize("values", [{}, {"motor.bearing_torque": True}, {"external.body_force": (0.0, 3.0, 1.0)}])
+def test_what_is_put_in_is_dissipated_or_stored(values, device, precision):
+    """In contact, the power of all velocities over a step is what its displacement leaves, to the error of the step."""
+    scene = touching_cell({"numerics.stepper": "implicit", "numerics.time_step": 2e-6, **values}, precision)
+    sim = Simulation(scene, device=device)
+    sim.advance(2e-4)
+    for until in (2.02e-4, 2.04e-4, 2.06e-4):
+        stored, steps = sims_stored(sim), sim.steps[0]
+        sim.advance(until)
+        assert sim.steps[0] == steps + 1
+        dissipated = sums(sim, "work") - (sums(sim, "energy") - stored)
+        assert dissipated == pytest.approx(sums(sim, "power") * 2e-6, rel=0.2) and dissipated > 0
+
+
+def sims_stored(sim: Simulation) -> float:
+    return float(sim.stepper.balance.stored.numpy()[0])
+
+
+def test_an_unstable_stepper_is_seen_within_microseconds(device, precision):
+    """Without its measure of stiffness the step is unstable for stiff filaments: energy a thousand times too large."""
+    stiff = {
+        "flagella.count": 1,
+        "flagella.length": 3.0,
+        "flagella.segment_length": 0.05,
+        "flagella.bending_rigidity": 350.0,
+        "flagella.twist_rigidity": 350.0,
+        "flagella.stretching_stiffness": 1e5,
+        "motor.torque": 1.0,
+        "hydrodynamics.mode": "consistent",
+        "body.anchored": True,
+        "numerics.precision": precision,
+    }
+    sound, sick = (Simulation(with_values(Scene(name="stiff"), stiff), device=device) for _ in range(2))
+    sound.advance(1e-5)
+    assert sums(sound, "refused") == 0
+    sick.stepper.stability = None
+    with pytest.raises(NumericalError) as caught:
+        sick.advance(4e-4)
+    assert caught.value.kind == Fault.BALANCE and caught.value.time < 2e-4
+    assert "flagella.bending_rigidity = 350, 100 times the default" in str(caught.value)
+
+
+def test_a_step_without_energy_before_it_is_not_judged(device):
+    sim = Simulation(cell({"numerics.stepper": "implicit"}), device=device)
+    sim.stepper.balance.stored.fill_(-1e9)
+    sim.advance(2e-6)
+    kept = sim.checkpoint()
+    assert sums(sim, "refused") == 0
+    sim.stepper.balance.stored.fill_(-1e9)  # now it looks as if energy came from nowhere
+    with pytest.raises(NumericalError, match="power balance"):
+        sim.advance(4e-6)
+    assert np.isin(["stepper.balance_stored", "stepper.balance_known"], list(kept)).all()

@@ -1,0 +1,137 @@
+"""What accuracy a run has kept: estimates of all steps added up, told, and limited."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from warpflag_kernels.stepping import accuracy
+from warpflag_kernels.stepping.health import Fault
+from warpflag_kernels.stepping.step_control import SHORTEST_STEP
+
+from tests.runs import executed, small, summary
+from warpflag.run import run
+from warpflag.run.simulation import NumericalError, Simulation
+from warpflag.run.summary import accuracy_kept, kept_words
+from warpflag.scene import Scene, with_values
+
+# Of the sums, relative: the device adds the same numbers in float64 in another order of operations.
+TOLERANCE = 1e-9
+# Round-off of float32 alone is thousands of times this.
+HOPELESS = {"numerics.precision": "float32", "numerics.accuracy": 1e-7, "duration": 1e-5}
+
+
+def sums(**given: float) -> dict[str, float]:
+    return dict.fromkeys(accuracy.SUMS, 0.0) | given
+
+
+def test_estimates_are_means_of_what_steps_may_make():
+    """Two steps of 1 and 3 us that err by 2 and 4 times what they may."""
+    systematic, independent = 1e-6 * 2 + 3e-6 * 4, 1e-6 * 2**2 + 3e-6 * 4**2
+    assert accuracy.estimates(sums(total=systematic, total_time=4e-6), False) == pytest.approx((3.5, 0.0))
+    found = accuracy.estimates(sums(total=independent, total_time=4e-6, window=independent, window_time=4e-6), True)
+    assert found == pytest.approx((13**0.5, 13**0.5))
+    assert accuracy.estimates(sums(), True) is None
+    # A window that has just begun does not count beside one that has ended; half a window does.
+    begun = sums(total=1.0, total_time=1.0, worst=3.0, window=5e-4, window_time=1e-5)
+    assert accuracy.estimates(begun, False) == (1.0, 3.0)
+    assert accuracy.estimates(begun | {"window": 6e-4, "window_time": 6e-5}, False) == pytest.approx((1.0, 10.0))
+    # A run that ends at once has not spent what a tenth of a millisecond may.
+    assert accuracy.last_span(sums(span=2e-4, span_time=1e-6), False) == pytest.approx(2.0)
+    assert accuracy.last_span(sums(span=8e-3, span_time=5e-4), True) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("stepper", ["implicit", "rkc"])
+def test_the_device_adds_up_the_estimates_of_accepted_steps(stepper, device):
+    """Steps of one pass each, whose estimate is read between two: that of implicit by its definition."""
+    scene = small({"numerics.stepper": stepper, "numerics.accuracy": 1e-3, "duration": 2.5e-4})
+    sim = Simulation(scene, device=device, capture=False)
+    steps, found, launch = sim.stepper.steps, [], sim.stepper.launch_pass
+
+    def watched() -> None:
+        before = sim.steps[0]
+        launch()
+        if sim.steps[0] > before:
+            dt = sim.system.control.step.numpy()[0]
+            if stepper == "rkc":
+                error = sim.stepper.data.error.numpy().max()
+            else:
+                data = sim.stepper.data
+                nodes = sim.first_node[-1] - len(sim.first_node) + 1
+                error = 7.0 * (1.5 * data.theta.numpy()[0] ** 2 - 0.5) * data.predictor_error.numpy().sum() / nodes
+            found.append((float(sim.times[0]), dt, float(error)))
+
+    sim.stepper.launch_pass = watched
+    sim.advance(scene.duration)
+    power = 0.5 if stepper == "implicit" else 1.0
+    times, lengths, errors = np.array(found)[2 if stepper == "implicit" else 0 :].T
+    counted = times >= accuracy.BEGIN * SHORTEST_STEP
+    times, lengths, errors = times[counted], lengths[counted], errors[counted]
+    assert 5 < counted.sum() < len(counted)
+    shares = (errors / (1e-3 * (lengths / 1e-3) ** power)) ** (1 / power)
+    achieved = {name: float(getattr(steps.achieved, name).numpy()[0]) for name in accuracy.SUMS}
+    assert achieved["total"] == pytest.approx((lengths * shares).sum(), rel=TOLERANCE)
+    assert achieved["total_time"] == pytest.approx(lengths.sum(), rel=TOLERANCE)
+    # Windows, cut by hand.
+    worst, worst_end, begin = 0.0, 0.0, 0
+    for i in range(len(times)):
+        inside = slice(begin, i + 1)
+        if lengths[inside].sum() >= accuracy.WINDOW:
+            level = ((lengths[inside] * shares[inside]).sum() / lengths[inside].sum()) ** power
+            if level > worst:
+                worst, worst_end = level, times[i]
+            begin = i + 1
+    assert worst > 0.0 and begin > 0
+    assert (achieved["worst"], achieved["worst_end"]) == pytest.approx((worst, worst_end), rel=TOLERANCE)
+    assert achieved["window_time"] == pytest.approx(lengths[begin:].sum(), rel=TOLERANCE)
+
+
+def test_a_run_beyond_ten_times_its_accuracy_stops_or_says_so(tmp_path):
+    with pytest.raises(NumericalError) as caught:
+        Simulation(small(HOPELESS), device="cpu").run()
+    assert caught.value.kind == Fault.ACCURACY and 1e-6 < caught.value.time < 1e-5
+    assert "numerics.on_accuracy = warn" in str(caught.value) and "segment" not in str(caught.value)
+    outcome = run.start(small(HOPELESS), str(tmp_path / "stopped"), "cpu").execute(quiet=True)
+    assert outcome.status == "stopped" and "error estimate" in outcome.message
+    directory = executed(small({**HOPELESS, "numerics.on_accuracy": "warn"}), tmp_path / "warned")
+    facts = summary(directory)["accuracy"]
+    assert facts["beyond"] and facts["estimate"] > 10 * facts["asked"] == pytest.approx(1e-6)
+    assert facts["steps_at_shortest"] > 100  # round-off asks for shorter steps than there are
+    assert "steps as short as estimates may ask for" in kept_words(facts)
+
+
+def test_a_run_that_ends_beyond_its_accuracy_is_not_done(tmp_path):
+    """It has erred by more than a tenth of a millisecond may, but not yet by what stops it at once."""
+    started = run.start(small(), str(tmp_path / "short"), "cpu")
+    started.simulation.stepper.steps.achieved.span.fill_(3e-2)
+    outcome = started.execute(quiet=True)
+    found = summary(tmp_path / "short")
+    assert outcome.status == found["status"] == "stopped" and found["guards"]["violated"]["kind"] == "accuracy"
+    assert found["frames"] == 9  # all of it is there
+    started = run.start(small({"numerics.on_accuracy": "warn"}), str(tmp_path / "warned"), "cpu")
+    started.simulation.stepper.steps.achieved.span.fill_(3e-2)
+    assert started.execute(quiet=True).status == "done"
+    assert summary(tmp_path / "warned")["accuracy"]["beyond"]
+
+
+@pytest.mark.parametrize("stepper", ["implicit", "rkc", "euler"])
+def test_a_summary_says_what_was_kept(stepper, tmp_path):
+    scene = small({"numerics.stepper": stepper, "duration": 4e-7 if stepper == "euler" else 8e-5})
+    started = run.start(scene, str(tmp_path / "run"), "cpu")
+    message = started.execute(quiet=True).message
+    facts = summary(tmp_path / "run")["accuracy"]
+    assert facts["asked"] == 5e-3 and not facts["beyond"]
+    if stepper == "euler":
+        assert facts["estimate"] is None and "error estimate" not in message
+        return
+    assert 1e-4 < facts["estimate"] < 5e-2 and f"{facts['estimate'] / 5e-3:.2g} times 0.005 um/ms" in message
+    own = accuracy_kept(scene, started.simulation.checkpoint())
+    assert own == facts
+
+
+def test_thin_fluids_may_have_shorter_steps():
+    """Ten times as thin, everything is ten times as fast."""
+    shortest = [
+        Simulation(with_values(Scene(name="x"), {"fluid.viscosity": eta}), device="cpu").stepper.steps.shortest.numpy()
+        for eta in (1e-3, 1e-4, 1e-2)
+    ]
+    np.testing.assert_allclose(np.concatenate(shortest), SHORTEST_STEP * np.array([1.0, 0.1, 1.0]))
