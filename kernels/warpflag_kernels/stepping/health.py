@@ -3,8 +3,7 @@
 A step too long, or a load too strong, gives wrong finite numbers long before it gives NaN. So at a start, every
 `interval` steps and at the end of an advance, these kernels check the state and record the first violated guard of
 each cell; the stepper then stops that cell. Crossings are found by moving both segments of a near pair linearly from
-the last check to this one: at the times when the four end points are coplanar, do the segments touch? Flagella without
-steric forces may pass through each other.
+the last check to this one: at the times when the four end points are coplanar, do they touch, if they can at all?
 """
 
 import functools
