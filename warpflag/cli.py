@@ -1,4 +1,4 @@
-"""The command line: `warpflag run`, `sweep`, `check`, `plot`, `render`, `export`, `compile`, `devices`.
+"""The command line: `warpflag run`, `sweep`, `tradeoff`, `check`, `plot`, `render`, `export`, `compile`, `devices`.
 
 Exit status: 0 done; 1 the machine failed the run (disk full, no permission); 2 bad input, a line for each problem; 3 a
 guard stopped the run; 130 interrupted by Ctrl-C, 143 terminated by a signal or out of wall time, both resumable.
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from warpflag import __version__, sweep_command
+from warpflag import __version__, sweep_command, tradeoff_command
 from warpflag.base.streams import protected_streams
 
 if TYPE_CHECKING:
@@ -93,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     run.set_defaults(command=_run)
 
     sweep_command.add(commands, _add_limits).set_defaults(command=_sweep)
+    tradeoff_command.add(commands)
 
     check = commands.add_parser(
         "check",

@@ -1,0 +1,117 @@
+"""The trade-off study: what it measures, its resumption, and shapes on other meshes."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.runs import small
+from warpflag.cli import main
+from warpflag.model.geometry import initial_state
+from warpflag.run.run_directory import RunError
+from warpflag.run.simulation import Simulation
+from warpflag.run.tradeoff import Study, choices, compared, points, windows
+from warpflag.scene import with_values
+
+SCENE = {"duration": 8e-4, "frames": 8, "flagella.length": 3.0}
+MEASURED = ("accuracy 0.05", "accuracy 0.0005", "pairs float32", "h 0.3", "h 0.1")
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """A study of a few choices, and how many points its second start measured."""
+    directory = tmp_path_factory.mktemp("study") / "made"
+    every = choices.choices_of
+    with pytest.MonkeyPatch.context() as patch:
+        few = lambda scene, devices: [c for c in every(scene, devices) if c.name in MEASURED]  # noqa: E731
+        patch.setattr(choices, "choices_of", few)
+        said = Study(small(SCENE), str(directory), "cpu").execute(120.0, quiet=True)
+        again, measured = [], points.measured
+        patch.setattr(points, "measured", lambda *given: again.append(given) or measured(*given))
+        assert Study(small(SCENE), str(directory), "cpu").execute(120.0, quiet=True) == said
+    return directory, said, again
+
+
+def test_finished_points_are_not_measured_again(studied):
+    assert studied[2] == []
+
+
+def test_the_table_has_every_point_beside_its_reference(studied):
+    directory, said, _ = studied
+    with open(directory / "tradeoff.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = {row["window"] for row in rows}
+    assert {"start", "late"} <= names and len(rows) == len(names) * (len(MEASURED) + 1)
+    assert all(row["status"] == "done" and float(row["cost_ms_per_ms"]) > 0 for row in rows)
+    for window in names:
+        error = {row["choice"]: float(row["node_error_um"]) for row in rows if row["window"] == window}
+        assert 0 < 5 * error["accuracy 0.0005"] < error["accuracy 0.05"] < 0.1
+        assert np.isnan(error["h 0.1"]) and np.isnan(error["reference"])
+        off = {row["choice"]: float(row["speed_off"]) for row in rows if row["window"] == window}
+        assert off["h 0.1"] == 0.0 != off["reference"]
+    assert (directory / "tradeoff.png").stat().st_size > 1000
+    for level in ("draft", "standard", "careful"):
+        assert f"# {level}: " in said
+    assert "[numerics]" in said and "accuracy = " in said
+
+
+def test_a_directory_of_another_scene_is_refused(studied):
+    with pytest.raises(RunError, match=r"motor\.torque"):
+        Study(small({**SCENE, "motor.torque": 1.0}), str(studied[0]), "cpu")
+
+
+def test_hardly_any_time_gives_no_error(tmp_path):
+    said = Study(small(SCENE), str(tmp_path / "made"), "cpu").execute(0.01, quiet=True)
+    assert "run it again" in said and "\n" not in said
+
+
+def test_nonsense_is_refused_before_anything_is_made(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text('name = "wrong"\n[motor]\ntorque = "much"\n')
+    assert main(["tradeoff", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "made")]) == 2
+    assert "motor.torque" in capsys.readouterr().err and not (tmp_path / "made").exists()
+
+
+def test_a_shape_on_another_mesh_is_the_same_curve():
+    coarse = small({"flagella.length": 6.0, "flagella.segment_length": 0.2})
+    fine = with_values(coarse, {"flagella.segment_length": 0.05})
+    shape = initial_state(coarse)
+    assert all(
+        np.array_equal(a, b) for a, b in zip(windows.on_mesh(shape, coarse).positions, shape.positions, strict=True)
+    )
+    there = windows.on_mesh(shape, fine)
+    back = windows.on_mesh(there, coarse)
+    for old, new, again in zip(shape.positions, there.positions, back.positions, strict=True):
+        assert len(new) == 121
+        np.testing.assert_allclose(np.linalg.norm(np.diff(new, axis=0), axis=1), 0.05, rtol=1e-12)
+        np.testing.assert_allclose(new[0], old[0], rtol=0, atol=1e-12)
+        assert np.abs(new[::4] - old).max() < 0.1 and np.abs(again - old).max() < 0.2
+    moved = windows.on_mesh(shape, with_values(coarse, {"hook.length": 0.1}))
+    assert np.linalg.norm(moved.positions[0] - shape.positions[0], axis=1) == pytest.approx(0.1)
+    Simulation(fine, device="cpu", starts=there).advance(2e-5)  # no guard stops it
+
+
+def summary(name, cost, error, **more):
+    found = compared.Summary(name, "time step", cost, error, 2, True, {"stepper": "implicit"})
+    return dataclasses.replace(found, **more)
+
+
+def test_the_front_and_what_is_recommended():
+    found = [
+        summary("a", 1.0, 4e-2),
+        summary("b", 2.0, 4e-3),
+        summary("worse", 3.0, 5e-3),
+        summary("c", 5.0, 4e-4),
+        summary("stopped", 0.5, 1e-6, sound=False),
+        summary("elsewhere", 0.5, 1e-6, windows=1),
+        summary("model", 0.5, 1e-6, source="model"),
+        summary("fixed", 0.9, 4.1e-2, settings={"time_step": 1e-5}),
+    ]
+    assert [s.choice for s in compared.front(found)] == ["fixed", "a", "b", "c"]
+    assert {level: s.choice for level, s in compared.recommended(found).items()} == {
+        "draft": "a",
+        "standard": "b",
+        "careful": "c",
+    }
