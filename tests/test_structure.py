@@ -18,7 +18,7 @@ PYTHON = [
 ]
 # From the bottom up: a room imports from itself and from those before it.
 ROOMS = {
-    "warpflag_kernels": ("base", "rod", "motor", "contact", "fluid", "stepping", "implicit"),
+    "warpflag_kernels": ("base", "rod", "motor", "contact", "fluid", "stepping", "implicit", "thermal"),
     "warpflag": (
         *("base", "scene", "record", "observables", "model", "stepping", "view", "run"),
         *("sweep_command", "tradeoff_command", "cli", "__main__"),

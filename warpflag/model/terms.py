@@ -119,6 +119,7 @@ def switches_of(scene: Scene) -> Switches:
         pairs=pairs,
         terms=tuple(term.name for term in SCENE_TERMS if term.needed(scene)),
         short_pairs=pairs != "none" and (numerics.precision, numerics.pair_precision) == ("float64", "float32"),
+        noise=scene.fluid.temperature > 0.0,
     )
 
 

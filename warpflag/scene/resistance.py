@@ -21,12 +21,14 @@ __all__ = [
     "pair_radius",
     "spheroid_mobility",
     "steric_diameter",
+    "thermal_energy",
 ]
 
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _PRINTED = (1.6e-3, 2.8e-3, 1.26e-6)  # gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s] of the paper
 _ZETA_3 = 1.2020569031595942
 _SOUND = 1 - 1e-9  # round-off of the condition that a pair radius was chosen by
+_BOLTZMANN = 1.380649e-5  # pN um/K, exact
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,23 @@ def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
         raise SceneError("flagella.segment_length", h, problem, ["hydrodynamics.mode", "hydrodynamics.pair_radius"])
     scale = 1 / (4 * math.pi * scene.fluid.viscosity * h)
     return FilamentMobility(scale * along, scale * across, 1 / (rotation * h))
+
+
+def thermal_energy(scene: Scene) -> float:
+    """kT [pN um]; zero without thermal noise.
+
+    Raises:
+        SceneError: the mobility has no root, because nodes have less than the self term of the pair sum.
+    """
+    if scene.fluid.temperature > 0.0 and scene.hydrodynamics.mode != "none":
+        own = 1 / (6 * math.pi * scene.fluid.viscosity * pair_radius(scene))
+        local = [filament_mobility(scene, spec.segment_length) for spec in scene.resolved_flagella()]
+        if min(min(m.along, m.across) for m in local) < own * (1 - 1e-9):
+            problem = "is too small for thermal noise: the mobility would not be positive definite; leave it out"
+            raise SceneError(
+                "hydrodynamics.pair_radius", scene.hydrodynamics.pair_radius, problem, ["fluid.temperature"]
+            )
+    return _BOLTZMANN * scene.fluid.temperature
 
 
 def _drag(scene: Scene) -> tuple[float, float, float]:

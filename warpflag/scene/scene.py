@@ -97,7 +97,14 @@ class Scene(Section, key=""):
         super().__post_init__()
         object.__setattr__(self, "flagellum", tuple(self.flagellum))
         problems = Problems()
-        for check in (self._check_body, self._check_step, self._check_pair_radius, self._check_start, self._check_hook):
+        for check in (
+            self._check_body,
+            self._check_step,
+            self._check_pair_radius,
+            self._check_start,
+            self._check_hook,
+            self._check_noise,
+        ):
             with problems.gathered():
                 check()
         self._check_flagella(problems)
@@ -160,6 +167,28 @@ class Scene(Section, key=""):
         if self.hook.stiffening_torque is not None and not self.hook.stiffness:
             problem = "must be absent where hook.stiffness = 0"
             raise SceneError("hook.stiffening_torque", self.hook.stiffening_torque, problem, ["hook.stiffness"])
+
+    def _check_noise(self) -> None:
+        """What thermal noise does not go with."""
+        key, temperature, related = "fluid.temperature", self.fluid.temperature, ["fluid.temperature"]
+        if temperature == 0.0:
+            if self.fluid.noise_tolerance is not None:
+                raise SceneError("fluid.noise_tolerance", self.fluid.noise_tolerance, f"needs {key} above 0", related)
+            return
+        mode, numerics = self.hydrodynamics.mode, self.numerics
+        if mode in ("between", "as_printed"):
+            problem = (
+                f"has no noise: that mobility is not positive definite; {key} needs none, within, all or consistent"
+            )
+            raise SceneError("hydrodynamics.mode", mode, problem, related)
+        if numerics.stepper == "rkc":
+            raise SceneError("numerics.stepper", "rkc", f"takes no {key}; implicit and euler do", related)
+        if numerics.accuracy is not None:
+            problem = f"must be absent with {key}: steps with noise are fixed, numerics.time_step"
+            raise SceneError("numerics.accuracy", numerics.accuracy, problem, related)
+        if not self.motor.bearing_torque:
+            problem = f"must be true with {key}: without it forces have no energy, and no equilibrium"
+            raise SceneError("motor.bearing_torque", False, problem, related)
 
     def _check_start(self) -> None:
         if self.start.record is None and self.start.frame != -1:

@@ -153,6 +153,16 @@ class Fluid(Section, key="fluid"):
     drag_rotation: float | None = number(
         None, "pN s", 1e-10, 1, "gamma_R, spin about the tangent", derived="1.26e-6 viscosity / 1e-3"
     )
+    temperature: float = number(0.0, "K", 0, 1e4, "of thermal noise; 0: none")
+    seed: int = integer(0, 0, 2**63 - 1, "of the random numbers of thermal noise")
+    noise_tolerance: float | None = number(
+        None,
+        "",
+        1e-6,
+        0.1,
+        "relative error of the random flows of the pair sum",
+        derived="what five products with it leave, 1e-4 to 3e-3",
+    )
 
 
 @dataclass(frozen=True)

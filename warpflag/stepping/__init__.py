@@ -25,6 +25,10 @@ def make_stepper(system: System, scenes: Sequence[Scene]) -> Stepper:
     names = {scene.numerics.stepper for scene in scenes}
     if len(names) != 1:
         raise SceneError("numerics.stepper", sorted(names), "must be the same in every scene of a batch")
+    if system.model.switches.noise:
+        from warpflag.stepping.thermal import ThermalStepper
+
+        return ThermalStepper(system, scenes, explicit=names == {"euler"})
     if names == {"implicit"}:
         return ImplicitStepper(system, scenes)
     return RkcStepper(system, scenes, euler=names == {"euler"})

@@ -27,11 +27,13 @@ class Switches:
             "free": those of a free filament, r_0 among them.
         terms: names of the force terms, see `warpflag_kernels.stepping.terms`.
         short_pairs: whether a float64 run has the pairs of the sum in float32, and their sums in float64.
+        noise: whether there is thermal noise.
     """
 
     pairs: str
     terms: tuple[str, ...]
     short_pairs: bool = False
+    noise: bool = False
 
     def has(self, term: str) -> bool:
         """Whether a force term is on."""

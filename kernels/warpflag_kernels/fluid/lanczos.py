@@ -1,0 +1,369 @@
+"""The random velocities of the Rotne-Prager sum R, self term included: R^1/2 z by Lanczos' process.
+
+With V the orthonormal basis of the Krylov space of R and z, T the tridiagonal matrix of R in it,
+
+    R^1/2 z = |z| V T^1/2 e_1        (Ando, Chow, Saad & Skolnick, J. Chem. Phys. 137, 064106 (2012)).
+
+R is well conditioned (4 to 13 for two flagella, apart or bundled), so five products err by 1e-4 to 3e-3. A cell may ask
+for a tolerance instead: products go on until the last one has changed the result by less, relative to its length. T^1/2
+comes from the eigenvalues of T, by Jacobi's rotations; a thread does the sums of a cell.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base import random_numbers
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.fluid import node_velocity
+from warpflag_kernels.fluid import noise as noise_stage
+
+PRODUCTS = 5  # of R, where no tolerance is asked for
+MOST = 20  # products at most: a condition of 100 then leaves less than 1e-3
+SWEEPS = 10  # of Jacobi's rotations at most; they converge quadratically, in four or five
+EXHAUSTED = 1.0e-6  # rest of a product over its length below which the Krylov space has no further dimension
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Lanczos`; vectors one after the other."""
+    vec3 = p.vec3
+
+    @wp.struct
+    class Lanczos:
+        basis: wp.array(dtype=vec3)  # [(MOST + 1) * E]
+        alpha: wp.array(dtype=wp.float64)  # [C * MOST], diagonal of T [um/(s pN)]
+        beta: wp.array(dtype=wp.float64)  # [C * MOST], beside it
+        size: wp.array(dtype=wp.float64)  # [C], |z|
+        weight: wp.array(dtype=wp.float64)  # [C * MOST], T^1/2 e_1 [(um/(s pN))^1/2]
+        matrix: wp.array(dtype=wp.float64)  # [C * MOST * MOST], work space
+        vectors: wp.array(dtype=wp.float64)  # [C * MOST * MOST], eigenvectors of T
+        tolerance: wp.array(dtype=wp.float64)  # [C], relative; 0: PRODUCTS products
+        error: wp.array(dtype=wp.float64)  # [C], last change of the result, relative
+        products: wp.array(dtype=wp.int32)  # [C], in this draw
+        total: wp.array(dtype=wp.int64)  # [C], products so far in the run
+        running: wp.array(dtype=wp.int32)  # [C], 1: another product is wanted
+        going: wp.array(dtype=wp.int32)  # [1], 1: some cell wants one
+
+    return Lanczos
+
+
+@dataclass(frozen=True)
+class Process:
+    """Lanczos' process on the device.
+
+    Attributes:
+        data: the struct `Lanczos`.
+        adaptive: whether some cell asks for a tolerance.
+    """
+
+    data: Any
+    adaptive: bool
+
+
+def allocate(model: DeviceModel, tolerances: Sequence[float]) -> Process:
+    """Room for the process.
+
+    Args:
+        model: of the batch.
+        tolerances: relative errors that cells ask for; 0: PRODUCTS products.
+    """
+    p, device, cells = model.precision, model.device, model.cell_count
+    z = struct(p)()
+    z.basis = wp.zeros((MOST + 1) * model.element_count, dtype=p.vec3, device=device)
+    for name, count in (("alpha", MOST), ("beta", MOST), ("weight", MOST), ("matrix", MOST**2), ("vectors", MOST**2)):
+        setattr(z, name, wp.zeros(cells * count, dtype=wp.float64, device=device))
+    z.size, z.error = wp.zeros(cells, dtype=wp.float64, device=device), wp.zeros(cells, dtype=wp.float64, device=device)
+    z.tolerance = wp.array(list(tolerances), dtype=wp.float64, device=device)
+    z.products, z.running = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(2))
+    z.total = wp.zeros(cells, dtype=wp.int64, device=device)
+    z.going = wp.ones(1, dtype=wp.int32, device=device)  # the first pass, without a cell, loads every kernel
+    return Process(z, any(tolerances))
+
+
+@functools.cache
+def _root(p: Precision) -> Any:
+    """Device function `root`: the first column of T^1/2, and how much the last product has changed it."""
+    Lanczos, most, sweeps = struct(p), wp.constant(MOST), wp.constant(SWEEPS)
+    module = p.module("lanczos_root")
+
+    @wp.func(module=module)
+    def rotate(
+        a: wp.array(dtype=wp.float64),
+        v: wp.array(dtype=wp.float64),
+        at: wp.int32,
+        n: wp.int32,
+        i: wp.int32,
+        j: wp.int32,
+    ):
+        """One rotation of Jacobi, which makes the entry (i, j) of the symmetric matrix a vanish."""
+        one, two = wp.float64(1.0), wp.float64(2.0)
+        off = a[at + i * most + j]
+        if off == wp.float64(0.0):
+            return
+        x = (a[at + j * most + j] - a[at + i * most + i]) / (two * off)
+        t = one / (wp.abs(x) + wp.sqrt(x * x + one))
+        if x < wp.float64(0.0):
+            t = -t
+        c = one / wp.sqrt(t * t + one)
+        s = t * c
+        for k in range(n):
+            f = a[at + k * most + i]
+            g = a[at + k * most + j]
+            a[at + k * most + i] = c * f - s * g
+            a[at + k * most + j] = s * f + c * g
+        for k in range(n):
+            f = a[at + i * most + k]
+            g = a[at + j * most + k]
+            a[at + i * most + k] = c * f - s * g
+            a[at + j * most + k] = s * f + c * g
+            f = v[at + k * most + i]
+            g = v[at + k * most + j]
+            v[at + k * most + i] = c * f - s * g
+            v[at + k * most + j] = s * f + c * g
+
+    @wp.func(module=module)
+    def root(z: Lanczos, c: wp.int32, n: wp.int32):
+        """Sets `weight` to T^1/2 e_1 after n products; returns the relative change since one product less."""
+        zero = wp.float64(0.0)
+        at = c * most * most
+        for i in range(n):
+            for j in range(n):
+                z.matrix[at + i * most + j] = zero
+                z.vectors[at + i * most + j] = zero
+            z.matrix[at + i * most + i] = z.alpha[c * most + i]
+            z.vectors[at + i * most + i] = wp.float64(1.0)
+            if i > 0:
+                z.matrix[at + i * most + i - 1] = z.beta[c * most + i - 1]
+                z.matrix[at + (i - 1) * most + i] = z.beta[c * most + i - 1]
+        for _sweep in range(sweeps):
+            for i in range(n - 1):
+                for j in range(i + 1, n):
+                    rotate(z.matrix, z.vectors, at, n, i, j)
+        changed = zero
+        size = zero
+        for i in range(n):
+            value = zero
+            for j in range(n):
+                eigenvalue = wp.sqrt(wp.max(z.matrix[at + j * most + j], zero))
+                value += z.vectors[at + i * most + j] * eigenvalue * z.vectors[at + j]
+            before = zero
+            if i + 1 < n:
+                before = z.weight[c * most + i]
+            changed += (value - before) * (value - before)
+            size += value * value
+            z.weight[c * most + i] = value
+        return wp.sqrt(changed / size)
+
+    return root
+
+
+@functools.cache
+def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    Model, State = structs(p).Model, structs(p).State
+    Noise, Lanczos = noise_stage.struct(p), struct(p)
+    normals, root = random_numbers.functions(p).normals, _root(p)
+    self_mobility = noise_stage.functions(p, pairs).self_mobility
+    drag_velocity = node_velocity.local(p).drag_velocity
+    most, fixed, for_pairs = wp.constant(MOST), wp.constant(PRODUCTS), wp.constant(random_numbers.PAIRS)
+    exhausted = wp.constant(wp.float64(EXHAUSTED))
+    module = p.module("lanczos")
+
+    @wp.kernel(module=module)
+    def begin(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        noise: Noise,
+        steps: wp.array(dtype=wp.int32),
+        # Out:
+        z: Lanczos,
+    ):
+        """z, of unit length, as the first vector of the basis."""
+        c = wp.tid()
+        z.running[c] = 0
+        if state.active[c] == 0:
+            return
+        begin_node = model.first_node[model.first_flagellum[c]]
+        total = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k]
+            z.basis[e] = vec3(real(0.0))
+            e += 1
+            while e < model.first_node[k + 1]:
+                xi = normals(noise.seed[c], e - begin_node, steps[c], for_pairs)
+                v = vec3(xi[0], xi[1], xi[2])
+                z.basis[e] = v
+                total += wp.float64(wp.dot(v, v))
+                e += 1
+            k += 1
+        size = wp.sqrt(total)
+        scale = real(wp.float64(1.0) / size)
+        e = begin_node
+        while e < model.first_node[model.first_flagellum[c + 1]]:
+            z.basis[e] = scale * z.basis[e]
+            e += 1
+        z.size[c] = size
+        z.products[c] = 0
+        z.running[c] = 1
+        z.going[0] = 1
+
+    @wp.kernel(module=module)
+    def load(
+        # Model:
+        model: Model,
+        # State:
+        z: Lanczos,
+        # Out:
+        state: State,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0 and z.running[c] != 0:
+            state.force[e] = z.basis[z.products[c] * model.cell_of.shape[0] + e]
+
+    @wp.kernel(module=module)
+    def advance(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        z: Lanczos,
+    ):
+        """One step of the process from the velocities of the last vector, and the root in the space so far."""
+        c = wp.tid()
+        if state.active[c] == 0 or z.running[c] == 0:
+            return
+        count = model.cell_of.shape[0]
+        n = z.products[c]
+        here = n * count
+        begin_node = model.first_node[model.first_flagellum[c]]
+        end = model.first_node[model.first_flagellum[c + 1]]
+        own = self_mobility(model, c)
+        alpha = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k]
+            z.basis[here + count + e] = vec3(real(0.0))
+            e += 1
+            while e < model.first_node[k + 1]:
+                q = z.basis[here + e]
+                w = state.velocity[e] - drag_velocity(model, state, e, k) + own * q
+                z.basis[here + count + e] = w
+                alpha += wp.float64(wp.dot(q, w))
+                e += 1
+            k += 1
+        beta = wp.float64(0.0)
+        if n > 0:
+            beta = z.beta[c * most + n - 1]
+        rest = wp.float64(0.0)
+        e = begin_node
+        while e < end:
+            w = z.basis[here + count + e] - real(alpha) * z.basis[here + e]
+            if n > 0:
+                w -= real(beta) * z.basis[here - count + e]
+            z.basis[here + count + e] = w
+            rest += wp.float64(wp.dot(w, w))
+            e += 1
+        rest = wp.sqrt(rest)
+        z.alpha[c * most + n] = alpha
+        z.beta[c * most + n] = rest
+        n += 1
+        z.products[c] = n
+        z.total[c] += wp.int64(1)
+        z.error[c] = root(z, c, n)
+        enough = n == fixed
+        if z.tolerance[c] > wp.float64(0.0):
+            enough = (n > 1 and z.error[c] <= z.tolerance[c]) or n == most
+        if enough or rest <= exhausted * alpha:
+            z.running[c] = 0
+            return
+        scale = real(wp.float64(1.0) / rest)
+        e = begin_node
+        while e < end:
+            z.basis[here + count + e] = scale * z.basis[here + count + e]
+            e += 1
+
+    @wp.kernel(module=module)
+    def look(
+        # State:
+        running: wp.array(dtype=wp.int32),
+        # Out:
+        going: wp.array(dtype=wp.int32),
+    ):
+        any_running = int(0)
+        for c in range(running.shape[0]):
+            any_running = wp.max(any_running, running[c])
+        going[0] = any_running
+
+    @wp.kernel(module=module)
+    def combine(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        z: Lanczos,
+        step: wp.array(dtype=wp.float64),
+        # Out:
+        noise: Noise,
+    ):
+        """Adds (2 kT/dt)^1/2 R^1/2 z to the thermal velocities."""
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        count = model.cell_of.shape[0]
+        total = vec3(real(0.0))
+        for j in range(z.products[c]):
+            total += real(z.weight[c * most + j]) * z.basis[j * count + e]
+        scale = real(wp.sqrt(wp.float64(2.0) * noise.energy[c] / step[c]) * z.size[c])
+        noise.node[e] = noise.node[e] + scale * vec4(total[0], total[1], total[2], real(0.0))
+
+    return SimpleNamespace(begin=begin, load=load, advance=advance, look=look, combine=combine)
+
+
+def draw_pairs(
+    model: DeviceModel,
+    state: DeviceState,
+    control: Any,
+    noise: Any,
+    process: Process,
+    velocities: Callable[[DeviceModel, DeviceState], None] = node_velocity.node_velocities,
+) -> None:
+    """Adds the thermal velocities of the pair sum to `noise`; forces and velocities of `state` are overwritten.
+
+    Args:
+        model, state: of the batch.
+        control: struct `Control`, with the step that begins and its number.
+        noise: struct `Noise`, with its local part.
+        process: room to work in.
+        velocities: finds node velocities from forces.
+    """
+    kernels, device, cells, z = _kernels(model.precision, True), model.device, model.cell_count, process.data
+
+    def multiply() -> None:
+        wp.launch(kernels.load, model.element_count, inputs=[model.data, z, state.data], device=device)
+        velocities(model, state)
+        wp.launch(kernels.advance, cells, inputs=[model.data, state.data, z], device=device)
+
+    def multiply_and_look() -> None:
+        multiply()
+        wp.launch(kernels.look, 1, inputs=[z.running, z.going], device=device)
+
+    wp.launch(kernels.begin, cells, inputs=[model.data, state.data, noise, control.steps, z], device=device)
+    if process.adaptive:
+        wp.capture_while(z.going, multiply_and_look)
+    else:
+        for _ in range(PRODUCTS):
+            multiply()
+    inputs = [model.data, state.data, z, control.step, noise]
+    wp.launch(kernels.combine, model.element_count, inputs=inputs, device=device)

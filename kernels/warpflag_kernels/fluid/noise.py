@@ -1,0 +1,198 @@
+"""Thermal velocities of a step: random ones whose covariance is that of the mobility, and the mean drift.
+
+By the fluctuation-dissipation theorem a step of length dt adds the velocity (2 kT/dt)^1/2 M^1/2 xi, xi normal deviates.
+M = S + R is drawn in two independent parts. R is the Rotne-Prager sum with its self term (`lanczos`). S is what the
+local mobility has beyond that self term, block-diagonal in nodes, so its root is closed:
+
+    S^1/2 xi = s_along^1/2 t (t.xi) + s_across^1/2 (xi - t (t.xi)),    s = mobility - 1/(6 pi eta a)
+
+and so are the roots for spins and body. kT div M, without which the measure would not be exp(-E/kT), comes from the
+local mobility alone: Rotne-Prager pairs, spins and a body whose mobility stands still in its own axes have no
+divergence. At a node between segments e and f of tangents t_e, t_f and lengths l_e, l_f
+
+    kT (mobility_along - mobility_across) [tr(G) t + G t],
+    G = (1 - t t) [(1 - t_e t_e)/l_e - (1 - t_f t_f)/l_f]/|t_e + t_f|,
+
+and 2 t/l in the bracket at the last node.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base import random_numbers
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Noise`: settings of every cell, and the thermal velocities of the present step."""
+    vec4, vec6 = p.vec4, wp.types.vector(6, p.real)
+
+    @wp.struct
+    class Noise:
+        energy: wp.array(dtype=wp.float64)  # [C], kT [pN um]
+        seed: wp.array(dtype=wp.uint64)  # [C]
+        node: wp.array(dtype=vec4)  # [E], of the node [um/s] and of the spin [rad/s]
+        body: wp.array(dtype=vec6)  # [C] [um/s] and [rad/s]
+
+    return Noise
+
+
+def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
+    """The struct `Noise`, no velocities yet.
+
+    Args:
+        model: of the batch.
+        energies: kT of every cell [pN um].
+        seeds: of every cell.
+    """
+    p, device, n = model.precision, model.device, struct(model.precision)()
+    n.energy = wp.array(energies, dtype=wp.float64, device=device)
+    n.seed = wp.array(seeds, dtype=wp.uint64, device=device)
+    n.node = wp.zeros(model.element_count, dtype=p.vec4, device=device)
+    n.body = wp.zeros(model.cell_count, dtype=wp.types.vector(6, p.real), device=device)
+    return n
+
+
+@functools.cache
+def functions(p: Precision, pairs: bool) -> SimpleNamespace:
+    """Device functions of the local part, with or without a pair sum: `self_mobility`, `excess_root`, `drift`."""
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    four_thirds, two = wp.constant(real(4.0 / 3.0)), wp.constant(real(2.0))
+    module = p.module("noise_functions", "pairs" if pairs else "")
+
+    @wp.func(module=module)
+    def self_mobility(model: Model, c: wp.int32):
+        """1/(6 pi eta a), the self term of the pair sum [um/(s pN)]; zero without one."""
+        if wp.static(pairs):
+            return four_thirds * model.pairs.mobility[c] / model.pairs.radius[c]
+        return real(0.0)
+
+    @wp.func(module=module)
+    def node_tangent(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """Tangent of the local mobility at node e."""
+        t = state.pose.tangent[e]
+        if e + 1 < model.first_node[k + 1]:
+            t = wp.normalize(t + state.pose.tangent[e + 1])
+        return t
+
+    @wp.func(module=module)
+    def excess_root(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32, xi: vec3):
+        """S^1/2 xi at node e, not r_0 [(um/(s pN))^1/2]."""
+        own = self_mobility(model, c)
+        t = node_tangent(model, state, e, k)
+        # Across, the excess may be zero by the choice of the pair radius, and round-off of either sign.
+        along = wp.sqrt(wp.max(model.drag.mobility_along[e] - own, real(0.0)))
+        across = wp.sqrt(wp.max(model.drag.mobility_across[e] - own, real(0.0)))
+        part = wp.dot(t, xi) * t
+        return along * part + across * (xi - part)
+
+    @wp.func(module=module)
+    def projector(t: vec3):
+        return wp.identity(3, dtype=real) - wp.outer(t, t)
+
+    @wp.func(module=module)
+    def drift(model: Model, state: State, e: wp.int32, k: wp.int32):
+        """div M at node e, not r_0 [1/(pN s)]."""
+        scale = model.drag.mobility_along[e] - model.drag.mobility_across[e]
+        t = state.pose.tangent[e]
+        length = state.pose.length[e]
+        if e + 1 == model.first_node[k + 1]:
+            return (two * scale / length) * t
+        u = state.pose.tangent[e + 1]
+        total = wp.length(t + u)
+        mean = (t + u) / total
+        bracket = projector(t) * (real(1.0) / length) - projector(u) * (real(1.0) / state.pose.length[e + 1])
+        g = projector(mean) * bracket * (real(1.0) / total)
+        return scale * (wp.trace(g) * mean + g * mean)
+
+    return SimpleNamespace(self_mobility=self_mobility, excess_root=excess_root, drift=drift)
+
+
+@functools.cache
+def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
+    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
+    Model, State, Noise = structs(p).Model, structs(p).State, struct(p)
+    normals = random_numbers.functions(p).normals
+    f = functions(p, pairs)
+    excess_root, drift = f.excess_root, f.drift
+    for_node, for_shift, for_turn = (
+        wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
+    )
+    module = p.module("noise", "pairs" if pairs else "")
+
+    @wp.kernel(module=module)
+    def elements(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        step: wp.array(dtype=wp.float64),
+        steps: wp.array(dtype=wp.int32),
+        # Out:
+        noise: Noise,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        scale = real(wp.sqrt(wp.float64(2.0) * noise.energy[c] / step[c]))
+        own = e - model.first_node[model.first_flagellum[c]]
+        xi = normals(noise.seed[c], own, steps[c], for_node)
+        spin = scale * wp.sqrt(model.drag.spin_mobility[k]) * xi[3]
+        v = vec3(real(0.0))
+        if e > model.first_node[k]:
+            v = scale * excess_root(model, state, e, k, c, vec3(xi[0], xi[1], xi[2]))
+            v += real(noise.energy[c]) * drift(model, state, e, k)
+        noise.node[e] = vec4(v[0], v[1], v[2], spin)
+
+    @wp.func(module=module)
+    def root(axis: vec3, along: real, across: real, xi: vec3):
+        """Root of an axially symmetric mobility on a vector."""
+        part = wp.dot(axis, xi) * axis
+        return wp.sqrt(along) * part + wp.sqrt(across) * (xi - part)
+
+    @wp.kernel(module=module)
+    def bodies(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        step: wp.array(dtype=wp.float64),
+        steps: wp.array(dtype=wp.int32),
+        # Out:
+        noise: Noise,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        scale = real(wp.sqrt(wp.float64(2.0) * noise.energy[c] / step[c]))
+        a = normals(noise.seed[c], 0, steps[c], for_shift)
+        b = normals(noise.seed[c], 0, steps[c], for_turn)
+        axis = state.pose.body_axis[c]
+        body = model.body
+        u = scale * root(axis, body.mobility_along[c], body.mobility_across[c], vec3(a[0], a[1], a[2]))
+        w = scale * root(axis, body.spin_mobility[c], body.tumble_mobility[c], vec3(b[0], b[1], b[2]))
+        noise.body[c] = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
+
+    return SimpleNamespace(elements=elements, bodies=bodies)
+
+
+def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any) -> None:
+    """Thermal velocities of the parts of the mobility that are local, and the drift, into `noise`.
+
+    Args:
+        model, state: of the batch.
+        control: struct `Control`, with the step that begins and its number.
+        noise: struct `Noise`.
+    """
+    kernels = _kernels(model.precision, model.switches.pairs != "none")
+    inputs = [model.data, state.data, control.step, control.steps, noise]
+    wp.launch(kernels.elements, model.element_count, inputs=inputs, device=model.device)
+    wp.launch(kernels.bodies, model.cell_count, inputs=inputs, device=model.device)

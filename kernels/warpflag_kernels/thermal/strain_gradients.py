@@ -1,0 +1,180 @@
+"""Gradients of the strains: the stiffness without prestress, and the random elastic force that goes with it.
+
+The elastic energy is a sum of (k_s/2) (w_s - w_s^0)^2 over the strains of all joints and segments. With J the gradients
+of the strains, the stiffness that is left where no strain is loaded, and the force
+
+    H = J^T k J,        f = J^T (kT k)^1/2 xi,    xi one normal deviate for every strain,
+
+fit together: f has the covariance kT H. An implicit step that solves with H and takes f along reproduces exp(-E/kT) for
+stiff modes too (`equilibrium`). H is positive whatever the load, and exact to first order in the step.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base import random_numbers
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.fluid import noise as noise_stage
+from warpflag_kernels.rod import hessian
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions: gradients of the strains of a joint, and their stiffness."""
+    real, vec3 = p.real, p.vec3
+    Model, Pose = structs(p).Model, structs(p).Pose
+    half, zero, one, two = (wp.constant(real(x)) for x in (0.5, 0.0, 1.0, 2.0))
+    module = p.module("strain_gradients")
+
+    @wp.func(module=module)
+    def joint_gradients(model: Model, pose: Pose, i: wp.int32, k: wp.int32):
+        """Gradients of the three strains w1, w2, w3 of joint i of flagellum k.
+
+        Returns: with respect to the segment vector e, to f (rows: strains [1/um], for the tripod per unit vector), to
+        the spin of e and to that of f.
+        """
+        t = pose.tangent[i]
+        u = pose.tangent[i + 1]
+        a1 = pose.director[i]
+        b1 = pose.director[i + 1]
+        per_e = one / pose.length[i]
+        per_f = one / pose.length[i + 1]
+        per_chi = one / (one + wp.dot(t, u))
+        kb = wp.cross(t, u) * (two * per_chi)
+        third_e = (half * per_e) * kb
+        third_f = (half * per_f) * kb
+        first_e = vec3(zero)
+        first_f = vec3(zero)
+        second_e = vec3(zero)
+        second_f = vec3(zero)
+        spin_e = vec3(zero, zero, -one)
+        spin_f = vec3(zero, zero, one)
+        if i > model.first_node[k]:  # the hook bends freely
+            a2 = wp.cross(t, a1)
+            b2 = wp.cross(u, b1)
+            common = (t + u) * per_chi
+            w1 = half * wp.dot(kb, a1 + b1)
+            w2 = half * wp.dot(kb, a2 + b2)
+            mean1 = (a1 + b1) * per_chi
+            mean2 = (a2 + b2) * per_chi
+            first_e = per_e * (wp.cross(u, mean1) - w1 * common)
+            first_f = -per_f * (wp.cross(t, mean1) + w1 * common)
+            second_e = per_e * (wp.cross(u, mean2) - w2 * common)
+            second_f = -per_f * (wp.cross(t, mean2) + w2 * common)
+            spin_e = vec3(half * wp.dot(kb, a2), -half * wp.dot(kb, a1), -one)
+            spin_f = vec3(half * wp.dot(kb, b2), -half * wp.dot(kb, b1), one)
+        on_e = wp.matrix_from_rows(first_e, second_e, third_e)
+        on_f = wp.matrix_from_rows(first_f, second_f, third_f)
+        return on_e, on_f, spin_e, spin_f
+
+    @wp.func(module=module)
+    def joint_stiffness(model: Model, i: wp.int32, k: wp.int32):
+        """Stiffness of the three strains of a joint [pN um]."""
+        per_length = one / model.rod.segment_length[k]
+        if i == model.first_node[k]:
+            return vec3(zero, zero, model.rod.hook_rigidity[k] * per_length)
+        bend = model.rod.bending_rigidity[k] * per_length
+        return vec3(bend, bend, model.rod.twist_rigidity[k] * per_length)
+
+    return SimpleNamespace(joint_gradients=joint_gradients, joint_stiffness=joint_stiffness)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    Stiffness, Noise = hessian.struct(p), noise_stage.struct(p)
+    f = functions(p)
+    joint_gradients, joint_stiffness = f.joint_gradients, f.joint_stiffness
+    normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.STRAIN)
+    module = p.module("strain_noise")
+
+    @wp.kernel(module=module)
+    def stiffnesses(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        stiffness: Stiffness,
+    ):
+        i = wp.tid()
+        if state.active[model.cell_of[i]] == 0:
+            return
+        k = model.flagellum_of[i]
+        if i > model.first_node[k]:
+            t = state.pose.tangent[i]
+            per_length = model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
+            stiffness.stretch[i] = per_length * wp.outer(t, t)
+        if i + 1 == model.first_node[k + 1]:
+            return
+        on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
+        s = joint_stiffness(model, i, k)
+        loaded_e = wp.diag(s) * on_e
+        loaded_f = wp.diag(s) * on_f
+        stiffness.ee[i] = wp.transpose(on_e) * loaded_e
+        stiffness.ff[i] = wp.transpose(on_f) * loaded_f
+        stiffness.fe[i] = wp.transpose(on_f) * loaded_e
+        stiffness.e_first[i] = wp.transpose(loaded_e) * spin_e
+        stiffness.e_second[i] = wp.transpose(loaded_e) * spin_f
+        stiffness.f_first[i] = wp.transpose(loaded_f) * spin_e
+        stiffness.f_second[i] = wp.transpose(loaded_f) * spin_f
+        loaded_spin = wp.cw_mul(s, spin_e)
+        stiffness.spins[i] = vec3(
+            wp.dot(loaded_spin, spin_e), wp.dot(loaded_spin, spin_f), wp.dot(wp.cw_mul(s, spin_f), spin_f)
+        )
+
+    @wp.kernel(module=module)
+    def random_moments(
+        # Model:
+        model: Model,
+        # State:
+        noise: Noise,
+        steps: wp.array(dtype=wp.int32),
+        share: real,
+        # Out:
+        state: State,
+    ):
+        """Adds random moments at every joint and the random tension of the segment after it to the gradients."""
+        i = wp.tid()
+        c = model.cell_of[i]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[i]
+        if i + 1 == model.first_node[k + 1]:
+            return
+        xi = normals(noise.seed[c], i - model.first_node[model.first_flagellum[c]], steps[c], for_strain)
+        scale = share * real(wp.sqrt(noise.energy[c]))
+        on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
+        s = joint_stiffness(model, i, k)
+        m = scale * vec3(wp.sqrt(s[0]) * xi[0], wp.sqrt(s[1]) * xi[1], wp.sqrt(s[2]) * xi[2])
+        tension = scale * wp.sqrt(model.rod.stretching_stiffness[k] / model.rod.segment_length[k]) * xi[3]
+        state.joint_before[i] = state.joint_before[i] + wp.transpose(on_e) * m
+        state.joint_after[i] = state.joint_after[i] + wp.transpose(on_f) * m + tension * state.pose.tangent[i + 1]
+        state.joint_spin_before[i] = state.joint_spin_before[i] + wp.dot(m, spin_e)
+        state.joint_spin_after[i] = state.joint_spin_after[i] + wp.dot(m, spin_f)
+
+    return SimpleNamespace(stiffnesses=stiffnesses, random_moments=random_moments)
+
+
+def stiffness_without_prestress(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
+    """J^T k J joint by joint and segment by segment, into `stiffness`, in place of the second derivatives."""
+    inputs = [model.data, state.data, stiffness]
+    wp.launch(_kernels(model.precision).stiffnesses, model.element_count, inputs=inputs, device=model.device)
+
+
+def add_random_moments(model: DeviceModel, state: DeviceState, noise: Any, steps: Any, share: float) -> None:
+    """Adds the random elastic force to the joints' energy gradients, which have been evaluated.
+
+    Args:
+        model, state: of the batch.
+        noise: struct `Noise`.
+        steps: number of the step that begins, shape [cell_count].
+        share: factor on the force.
+    """
+    inputs = [model.data, noise, steps, share, state.data]
+    wp.launch(_kernels(model.precision).random_moments, model.element_count, inputs=inputs, device=model.device)

@@ -1,0 +1,187 @@
+"""Stepping with thermal noise: `warpflag_kernels.thermal`, for scenes with a temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from warpflag_kernels.base import clock
+from warpflag_kernels.contact import contact_list, search
+from warpflag_kernels.fluid import body, lanczos, node_velocity, noise
+from warpflag_kernels.implicit import (
+    block_band,
+    contact_solve,
+    delassus,
+    krylov,
+    linear_system,
+    linearised,
+    quasi_newton,
+    stability,
+    step_flow,
+)
+from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
+from warpflag_kernels.stepping import health
+from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
+from warpflag_kernels.thermal import additive_chart, equilibrium, strain_gradients
+
+from warpflag.scene import Scene
+from warpflag.scene.resistance import thermal_energy
+from warpflag.stepping.rkc import euler_step
+from warpflag.stepping.stepper import System
+
+__all__ = ["THERMAL_STEP", "ThermalStepper", "thermal_step"]
+
+THERMAL_STEP = 1.0e-6
+"""Step of `implicit` with a temperature where `numerics.time_step` is absent [s]."""
+
+
+def thermal_step(scene: Scene) -> float:
+    """The fixed step of a scene with a temperature [s]."""
+    numerics = scene.numerics
+    return numerics.time_step or (euler_step(scene) if numerics.stepper == "euler" else THERMAL_STEP)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a step works on: structs `Control`, `Chart`, `Band`, `Contacts`, `ContactLaw`; empty where it needs none."""
+
+    control: Any
+    chart: Any
+    band: Any
+    contacts: Any
+    law: Any
+
+
+class ThermalStepper:
+    """Fixed steps with thermal noise, linearly implicit with a random elastic force, or explicit (Euler-Maruyama).
+
+    Args:
+        system: what to advance.
+        scenes: one per cell, all with a temperature; `numerics.time_step` is the step.
+        explicit: whether steps are explicit.
+
+    Attributes:
+        noise: the struct `Noise`.
+        lanczos: the process that draws the noise of the pair sum; None where there is none.
+        stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the start of the step; of an explicit stepper
+            none.
+    """
+
+    def __init__(self, system: System, scenes: Sequence[Scene], explicit: bool) -> None:
+        self._system, self._explicit = system, explicit
+        model = system.model
+        p, device = model.precision, model.device
+        energies = [thermal_energy(scene) for scene in scenes]
+        self.noise = noise.allocate(model, energies, [scene.fluid.seed for scene in scenes])
+        self._flows = model.switches.pairs != "none"
+        self.lanczos: Any = None
+        if self._flows:
+            self.lanczos = lanczos.allocate(model, [scene.fluid.noise_tolerance or 0.0 for scene in scenes])
+        self._x, self._solved = chain_chart.allocate(model), None
+        self._work = additive_chart.allocate(model)
+        self._smooth_terms = tuple(term for term in model.terms if not term.contact)
+        self._touching = model.touching and not explicit
+        self.stability: Any = None
+        if explicit:
+            band, contacts, law = block_band.types(p).Band(), contact_list.struct(p)(), delassus.struct(p)()
+        else:
+            band = block_band.allocate(model)
+            contacts = contact_list.allocate(model, self._touching)
+            law = delassus.allocate(model, contacts)
+            quasi_newton.allocate(model, contacts, law)
+            self.flow = step_flow.allocate(model)
+            self.stiffness = hessian.allocate(model)
+            self._solved, self._product = chain_chart.allocate(model), chain_chart.allocate(model)
+            self._magnitude = wp.zeros(len(contacts.gap), dtype=p.real, device=device)
+            self._no_share = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
+            linearised.allocate(model, system.state)
+            if self._flows:
+                self._krylov = krylov.allocate(model)
+                self.stability = stability.allocate(model)
+                self.stability.strong.fill_(1)  # every cell is solved with the full mobility
+        self.band = band
+        self._parts = Parts(system.control, system.chart, band, contacts, law)
+        system.control.longest_step.assign([thermal_step(scene) for scene in scenes])
+        system.guard.interval.fill_(1)
+        self.restart()
+
+    def launch_pass(self) -> None:
+        s, parts, explicit = self._system, self._parts, self._explicit
+        model, state = s.model, s.state
+        equilibrium.begin_step(model, state, parts, explicit)
+        reconstruction.reconstruct(model, state, s.chart)
+        noise.draw_local(model, state, s.control, self.noise)
+        if explicit:
+            self._draw_pairs()
+            launch_right_hand_side(model, state)
+        else:
+            self._evaluate()
+        equilibrium.right_hand_side(model, state, parts, self.noise, self._x, explicit)
+        x = self._x if explicit else self._solve()
+        additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
+        listed = parts.contacts if self._touching else None
+        health.check(model, state, s.chart, s.guard, s.control, listed)
+        equilibrium.decide(model, state, parts, explicit)
+        comoving_chart.commit(model, state, s.chart)
+        health.remember(model, state, s.chart, s.guard, s.control)
+        equilibrium.finish_step(model, state, parts, explicit)
+        clock.count_pass(s.control, model.device)
+
+    def _draw_pairs(self, velocities: Any = node_velocity.node_velocities) -> None:
+        s = self._system
+        if self._flows:
+            lanczos.draw_pairs(s.model, s.state, s.control, self.noise, self.lanczos, velocities)
+
+    def _evaluate(self) -> None:
+        """Thermal velocities, contacts, forces with the random elastic ones, and velocities, where the step starts."""
+        s, parts = self._system, self._parts
+        model, state, share = s.model, s.state, (2.0 * equilibrium.THETA - 1.0) ** 0.5
+        if self._touching:
+            search.find(model, state, state.data.pose, parts.contacts)
+            contact_solve.warm_start(model, state, self._no_share, self._x, parts.contacts, parts.law)
+        if self._flows:
+            step_flow.build(model, state, self.flow, parts.contacts if self._touching else None)
+        if step_flow.stores_pairs(model):
+            self._draw_pairs(lambda model, state: step_flow.single_velocities(model, state, self.flow))
+        else:
+            self._draw_pairs()
+        for term in self._smooth_terms:
+            if term.launch is not None:
+                term.launch(model, state)
+        strain_gradients.add_random_moments(model, state, self.noise, s.control.steps, share)
+        forces.total_forces(model, state, self._smooth_terms)
+        if self._touching:
+            equilibrium.random_contacts(model, state, parts, self.noise, share, self._magnitude)
+            contact_list.act(model, state, parts.contacts, self._magnitude)
+        body.body_motion(model, state)
+        node_velocity.node_velocities(model, state)
+
+    def _solve(self) -> Any:
+        """The increment of the step, from the right side."""
+        model, state, parts = self._system.model, self._system.state, self._parts
+        strain_gradients.stiffness_without_prestress(model, state, self.stiffness)
+        linear_system.factorise(model, state, self.stiffness, parts.band)
+        linear_system.solve(model, state, parts.band, self._x)
+        found = self._x
+        if self._touching:
+            found = self._solved
+            contact_solve.solve(model, state, parts.contacts, parts.band, self.flow, self._x, parts.law, found)
+        if self._flows:
+            krylov.solve(
+                model, state, self.stiffness, parts.band, parts.law.gain, self.stability, self._krylov,
+                self._product, found,
+            )  # fmt: skip
+        return found
+
+    def restart(self) -> None:
+        """A step knows nothing of those before it."""
+
+    def memory(self) -> dict[str, np.ndarray]:
+        return {} if self.lanczos is None else {"products": self.lanczos.data.total.numpy().copy()}
+
+    def recall(self, memory: dict[str, np.ndarray]) -> None:
+        for values in memory.values():
+            self.lanczos.data.total.assign(values)
