@@ -34,6 +34,7 @@ SWITCHES = {
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
+WARM = {"fluid.temperature": 300.0}  # steps with thermal noise: implicit and explicit
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
 VARIANTS = [
@@ -66,7 +67,7 @@ def launched(
     by_cells: cut as for a CPU.
     """
     kernels = set()
-    controlled = {} if stepper == "euler" else {"numerics.accuracy": 1e-3}
+    controlled = {} if stepper == "euler" or "fluid.temperature" in switches else {"numerics.accuracy": 1e-3}
     scene = cell({"numerics.stepper": stepper, **controlled, **switches}, precision)
     with monkeypatch.context() as patch:
         own = plan(scene, "cpu")
@@ -95,10 +96,13 @@ def without_precision() -> set[Any]:
 def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole = set().union(*(launched(monkeypatch, precision, stepper, {}) for stepper in STEPPERS))
     whole |= launched(monkeypatch, precision, "implicit", CROWD)
+    whole |= set().union(*(launched(monkeypatch, precision, stepper, WARM) for stepper in ("implicit", "euler")))
+    whole |= launched(monkeypatch, precision, "implicit", {**WARM, "fluid.noise_tolerance": 1e-3})
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)
+    on_cpu |= launched(monkeypatch, precision, "implicit", WARM, by_cells=True)
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.

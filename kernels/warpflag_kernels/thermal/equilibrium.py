@@ -76,7 +76,7 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
             contacts_out.overflow[c] = 0
             law.gain[c] = theta
             law.failed[c] = 0
-            law.tolerance[c] = gap_tolerance * model.steric.diameter[c]
+            law.gap_tolerance[c] = gap_tolerance * model.steric.diameter[c]
 
     @wp.kernel(module=module)
     def clear(
