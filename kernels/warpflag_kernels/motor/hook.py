@@ -27,7 +27,7 @@ from warpflag_kernels.rod import hessian
 @functools.cache
 def joint(p: Precision) -> SimpleNamespace:
     """Device functions: the helix axis in the lab, and the stiffness under the motor's torque."""
-    Model, State = structs(p).Model, structs(p).State
+    real, Model, State = p.real, structs(p).Model, structs(p).State
     motor_torque = torque.functions(p).motor_torque
     module = p.module("hook_joint")
 
@@ -44,9 +44,24 @@ def joint(p: Precision) -> SimpleNamespace:
     def stiffness(model: Model, state: State, k: wp.int32):
         """k of flagellum k [pN um/rad]."""
         stiffening = model.hook.stiffening[k] * wp.abs(motor_torque(model, state, k))
-        return model.hook.stiffness[k] * (p.real(1.0) + stiffening)
+        return model.hook.stiffness[k] * (real(1.0) + stiffening)
 
-    return SimpleNamespace(helix_axis=helix_axis, stiffness=stiffness)
+    @wp.func(module=module)
+    def axis_rates(model: Model, state: State, k: wp.int32):
+        """Rates of a beside m that is carried along by the minimal rotation of m onto a: by the segment vector, by its
+        spin, and by m (the carried rate, as the matrix that takes m's)."""
+        i = model.first_node[k]
+        m = state.pose.tangent[i]
+        t = state.pose.tangent[i + 1]
+        a = helix_axis(model, state, k)
+        c = wp.dot(m, a)
+        p_ = wp.cross(a, m)
+        by_segment = -(wp.skew(a) * wp.skew(t)) / state.pose.length[i + 1]
+        by_spin = wp.cross(t, a)
+        carried = c * wp.identity(3, dtype=real) - wp.skew(p_) + wp.outer(p_, p_) / (real(1.0) + c)
+        return by_segment, by_spin, carried
+
+    return SimpleNamespace(helix_axis=helix_axis, stiffness=stiffness, axis_rates=axis_rates)
 
 
 @functools.cache
@@ -99,7 +114,7 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
-    helix_axis, stiffness = joint(p).helix_axis, joint(p).stiffness
+    helix_axis, stiffness, axis_rates = joint(p).helix_axis, joint(p).stiffness, joint(p).axis_rates
     module = p.module("hook")
 
     @wp.kernel(module=module)
@@ -147,12 +162,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         along = s * q * q * q
         if c < real(0.0):
             along = s * q * (three * q - two) / (one - c * c)
-        # Rates of a beside m that is carried along by the minimal rotation of m onto a: by the segment vector, by its
-        # spin, and by m (the carried rate, as the matrix that takes m's).
-        skew_a = wp.skew(a)
-        by_segment = -(skew_a * wp.skew(t)) / length
-        by_spin = wp.cross(t, a)
-        carried = c * wp.identity(3, dtype=real) - wp.skew(p_) + wp.outer(p_, p_) / (one + c)
+        by_segment, by_spin, carried = axis_rates(model, state, k)
         # Of the cosine.
         cosine_by_segment = wp.cross(p_, t) / length
         cosine_by_spin = wp.dot(p_, t)

@@ -7,6 +7,9 @@ of the strains, the stiffness that is left where no strain is loaded, and the fo
 
 fit together: f has the covariance kT H. An implicit step that solves with H and takes f along reproduces exp(-E/kT) for
 stiff modes too (`equilibrium`). H is positive whatever the load, and exact to first order in the step.
+
+A hook that resists bending has the energy (k/2) s^2, s = 2 tan(beta/2) the distance of helix axis and motor axis in a
+stereographic projection, which keeps angles: the gradient of s has the length q = 1/cos^2(beta/2) in both directions.
 """
 
 import functools
@@ -19,6 +22,7 @@ from warpflag_kernels.base import random_numbers
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import noise as noise_stage
+from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import hessian
 
 
@@ -161,10 +165,80 @@ def _kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(stiffnesses=stiffnesses, random_moments=random_moments)
 
 
+@functools.cache
+def _hook_kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State = structs(p).Model, structs(p).State
+    Stiffness, Noise = hessian.struct(p), noise_stage.struct(p)
+    joint = hook.joint(p)
+    helix_axis, hook_stiffness, axis_rates = joint.helix_axis, joint.stiffness, joint.axis_rates
+    normals, for_hook = random_numbers.functions(p).normals, wp.constant(random_numbers.HOOK)
+    module = p.module("hook_noise")
+
+    @wp.func(module=module)
+    def conformal_factor(model: Model, state: State, k: wp.int32):
+        """q of flagellum k."""
+        c = wp.dot(state.pose.tangent[model.first_node[k]], helix_axis(model, state, k))
+        return real(2.0) / (real(1.0) + c)
+
+    @wp.kernel(module=module)
+    def add_stiffness(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        out: Stiffness,
+    ):
+        k = wp.tid()
+        i = model.first_node[k]
+        if state.active[model.cell_of[i]] == 0:
+            return
+        q = conformal_factor(model, state, k)
+        s = hook_stiffness(model, state, k) * q * q
+        by_segment, by_spin, carried = axis_rates(model, state, k)
+        out.ee[i] = out.ee[i] + s * (wp.transpose(carried) * carried)
+        out.ff[i] = out.ff[i] + s * (wp.transpose(by_segment) * by_segment)
+        out.fe[i] = out.fe[i] - s * (wp.transpose(by_segment) * carried)
+        out.e_second[i] = out.e_second[i] - s * (wp.transpose(carried) * by_spin)
+        out.f_second[i] = out.f_second[i] + s * (wp.transpose(by_segment) * by_spin)
+        out.spins[i] = out.spins[i] + vec3(real(0.0), real(0.0), s * wp.dot(by_spin, by_spin))
+
+    @wp.kernel(module=module)
+    def add_random_moment(
+        # Model:
+        model: Model,
+        # State:
+        noise: Noise,
+        steps: wp.array(dtype=wp.int32),
+        share: real,
+        # Out:
+        state: State,
+    ):
+        k = wp.tid()
+        i = model.first_node[k]
+        c = model.cell_of[i]
+        if state.active[c] == 0:
+            return
+        xi = normals(noise.seed[c], i - model.first_node[model.first_flagellum[c]], steps[c], for_hook)
+        q = conformal_factor(model, state, k)
+        scale = share * q * wp.sqrt(real(noise.energy[c]) * hook_stiffness(model, state, k))
+        by_segment, by_spin, carried = axis_rates(model, state, k)
+        m = scale * vec3(xi[0], xi[1], xi[2])
+        state.joint_before[i] = state.joint_before[i] - wp.transpose(carried) * m
+        state.joint_after[i] = state.joint_after[i] + wp.transpose(by_segment) * m
+        state.joint_spin_after[i] = state.joint_spin_after[i] + wp.dot(m, by_spin)
+
+    return SimpleNamespace(add_stiffness=add_stiffness, add_random_moment=add_random_moment)
+
+
 def stiffness_without_prestress(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
     """J^T k J joint by joint and segment by segment, into `stiffness`, in place of the second derivatives."""
-    inputs = [model.data, state.data, stiffness]
-    wp.launch(_kernels(model.precision).stiffnesses, model.element_count, inputs=inputs, device=model.device)
+    inputs, device = [model.data, state.data, stiffness], model.device
+    wp.launch(_kernels(model.precision).stiffnesses, model.element_count, inputs=inputs, device=device)
+    if model.switches.has("hook"):
+        kernel = _hook_kernels(model.precision).add_stiffness
+        wp.launch(kernel, model.flagellum_count, inputs=inputs, device=device)
 
 
 def add_random_moments(model: DeviceModel, state: DeviceState, noise: Any, steps: Any, share: float) -> None:
@@ -176,5 +250,8 @@ def add_random_moments(model: DeviceModel, state: DeviceState, noise: Any, steps
         steps: number of the step that begins, shape [cell_count].
         share: factor on the force.
     """
-    inputs = [model.data, noise, steps, share, state.data]
-    wp.launch(_kernels(model.precision).random_moments, model.element_count, inputs=inputs, device=model.device)
+    inputs, device = [model.data, noise, steps, share, state.data], model.device
+    wp.launch(_kernels(model.precision).random_moments, model.element_count, inputs=inputs, device=device)
+    if model.switches.has("hook"):
+        kernel = _hook_kernels(model.precision).add_random_moment
+        wp.launch(kernel, model.flagellum_count, inputs=inputs, device=device)
