@@ -127,7 +127,7 @@ def test_lanczos_root_of_the_pair_sum(mode, precision, device):
             for v, w, exact in zip(found, z, roots, strict=True):
                 assert np.linalg.norm(v - exact @ w) < most * np.linalg.norm(v)
         products = draw.stepper.lanczos.data.products.numpy()
-        assert np.all(products == 5) if tolerance is None else products.max() < lanczos.MOST
+        assert np.all(products == 5) if tolerance is None else products.max() < lanczos.MOST_PRODUCTS
 
 
 def test_velocities_have_the_covariance_of_the_mobility(device):

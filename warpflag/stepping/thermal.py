@@ -143,7 +143,7 @@ class ThermalStepper:
     def _evaluate(self) -> None:
         """Thermal velocities, contacts, forces with the random elastic ones, and velocities, where the step starts."""
         s, parts = self._system, self._parts
-        model, state, share = s.model, s.state, (2.0 * equilibrium.THETA - 1.0) ** 0.5
+        model, state, share = s.model, s.state, (2.0 * equilibrium.IMPLICITNESS - 1.0) ** 0.5
         if self._touching:
             search.find(model, state, state.data.pose, parts.contacts)
             contact_solve.warm_start(model, state, self._no_share, self._x, parts.contacts, parts.law)

@@ -24,8 +24,8 @@ from warpflag_kernels.fluid import node_velocity
 from warpflag_kernels.fluid import noise as noise_stage
 
 PRODUCTS = 5  # of R, where no tolerance is asked for
-MOST = 20  # products at most: a condition of 100 then leaves less than 1e-3
-SWEEPS = 10  # of Jacobi's rotations at most; they converge quadratically, in four or five
+MOST_PRODUCTS = 20  # products at most: a condition of 100 then leaves less than 1e-3
+JACOBI_SWEEPS = 10  # of Jacobi's rotations at most; they converge quadratically, in four or five
 EXHAUSTED = 1.0e-6  # rest of a product over its length below which the Krylov space has no further dimension
 
 
@@ -36,13 +36,13 @@ def struct(p: Precision) -> Any:
 
     @wp.struct
     class Lanczos:
-        basis: wp.array(dtype=vec3)  # [(MOST + 1) * E]
-        alpha: wp.array(dtype=wp.float64)  # [C * MOST], diagonal of T [um/(s pN)]
-        beta: wp.array(dtype=wp.float64)  # [C * MOST], beside it
+        basis: wp.array(dtype=vec3)  # [(MOST_PRODUCTS + 1) * E]
+        alpha: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], diagonal of T [um/(s pN)]
+        beta: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], beside it
         size: wp.array(dtype=wp.float64)  # [C], |z|
-        weight: wp.array(dtype=wp.float64)  # [C * MOST], T^1/2 e_1 [(um/(s pN))^1/2]
-        matrix: wp.array(dtype=wp.float64)  # [C * MOST * MOST], work space
-        vectors: wp.array(dtype=wp.float64)  # [C * MOST * MOST], eigenvectors of T
+        weight: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], T^1/2 e_1 [(um/(s pN))^1/2]
+        matrix: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS * MOST_PRODUCTS], work space
+        vectors: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS * MOST_PRODUCTS], eigenvectors of T
         tolerance: wp.array(dtype=wp.float64)  # [C], relative; 0: PRODUCTS products
         error: wp.array(dtype=wp.float64)  # [C], last change of the result, relative
         products: wp.array(dtype=wp.int32)  # [C], in this draw
@@ -75,8 +75,14 @@ def allocate(model: DeviceModel, tolerances: Sequence[float]) -> Process:
     """
     p, device, cells = model.precision, model.device, model.cell_count
     z = struct(p)()
-    z.basis = wp.zeros((MOST + 1) * model.element_count, dtype=p.vec3, device=device)
-    for name, count in (("alpha", MOST), ("beta", MOST), ("weight", MOST), ("matrix", MOST**2), ("vectors", MOST**2)):
+    z.basis = wp.zeros((MOST_PRODUCTS + 1) * model.element_count, dtype=p.vec3, device=device)
+    for name, count in (
+        ("alpha", MOST_PRODUCTS),
+        ("beta", MOST_PRODUCTS),
+        ("weight", MOST_PRODUCTS),
+        ("matrix", MOST_PRODUCTS**2),
+        ("vectors", MOST_PRODUCTS**2),
+    ):
         setattr(z, name, wp.zeros(cells * count, dtype=wp.float64, device=device))
     z.size, z.error = wp.zeros(cells, dtype=wp.float64, device=device), wp.zeros(cells, dtype=wp.float64, device=device)
     z.tolerance = wp.array(list(tolerances), dtype=wp.float64, device=device)
@@ -89,7 +95,7 @@ def allocate(model: DeviceModel, tolerances: Sequence[float]) -> Process:
 @functools.cache
 def _root(p: Precision) -> Any:
     """Device function `root`: the first column of T^1/2, and how much the last product has changed it."""
-    Lanczos, most, sweeps = struct(p), wp.constant(MOST), wp.constant(SWEEPS)
+    Lanczos, most, sweeps = struct(p), wp.constant(MOST_PRODUCTS), wp.constant(JACOBI_SWEEPS)
     module = p.module("lanczos_root")
 
     @wp.func(module=module)
@@ -171,7 +177,7 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
     normals, root = random_numbers.functions(p).normals, _root(p)
     self_mobility = noise_stage.functions(p, pairs).self_mobility
     drag_velocity = node_velocity.local(p).drag_velocity
-    most, fixed, for_pairs = wp.constant(MOST), wp.constant(PRODUCTS), wp.constant(random_numbers.PAIRS)
+    most, fixed, for_pairs = wp.constant(MOST_PRODUCTS), wp.constant(PRODUCTS), wp.constant(random_numbers.PAIRS)
     exhausted = wp.constant(wp.float64(EXHAUSTED))
     module = p.module("lanczos")
 

@@ -28,7 +28,7 @@ from warpflag_kernels.rod.comoving_chart import vec6d
 # Newton iterations. Each leaves the square of the relative error; the body, which moves by the pull of its flagella
 # between them, holds its anchors some six times as firmly as the fluid holds a node: after the last one half a per cent
 # of its share is left.
-ITERATIONS = 4
+LENGTH_ITERATIONS = 4
 
 
 @functools.cache
@@ -296,7 +296,7 @@ def retract(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: An
     flagella, elements = model.flagellum_count, model.element_count
     wp.launch(kernels.move_bodies, cells, inputs=[model.data, x, state.data, chart], device=device)
     wp.launch(kernels.displace, elements, inputs=[model.data, state.data, chart, x, work], device=device)
-    for iteration in range(ITERATIONS if restoring else 0):
+    for iteration in range(LENGTH_ITERATIONS if restoring else 0):
         if iteration > 0:
             wp.launch(kernels.pull_bodies, cells, inputs=[model.data, work, state.data, chart], device=device)
         wp.launch(kernels.restore, flagella, inputs=[model.data, chart, state.data, work], device=device)

@@ -28,7 +28,7 @@ from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
 from warpflag_kernels.stepping.health import Fault, encode
 
-THETA = 1.0  # implicitness: 1 damps what is driven, 1/2 would leave stiff modes ringing for ever
+IMPLICITNESS = 1.0  # implicitness: 1 damps what is driven, 1/2 would leave stiff modes ringing for ever
 # Of a gap [sigma]: thermal gaps of a closed contact vary by some 0.07 sigma.
 GAP_TOLERANCE = 1.0e-4
 
@@ -41,7 +41,7 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), delassus.struct(p)
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     drag, advanced = block_band.functions(p).drag, clock.functions().advanced
-    theta, gap_tolerance = wp.constant(wp.float64(THETA)), wp.constant(real(GAP_TOLERANCE))
+    theta, gap_tolerance = wp.constant(wp.float64(IMPLICITNESS)), wp.constant(real(GAP_TOLERANCE))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
