@@ -34,7 +34,7 @@ SWITCHES = {
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
 }
 STEPPERS = ("rkc", "euler", "implicit")
-WARM = {"fluid.temperature": 300.0}  # steps with thermal noise: implicit and explicit
+WARM = {"fluid.temperature": 300.0, "hook.stiffness": 4.0}  # steps with thermal noise: implicit and explicit
 CROWD = {"flagella.count": 3}  # whose stability the implicit stepper measures
 # What switches leave out changes the right-hand side, which all steppers share, and the matrix of the implicit one.
 VARIANTS = [
