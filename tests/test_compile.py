@@ -99,6 +99,8 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole |= set().union(*(launched(monkeypatch, precision, stepper, WARM) for stepper in ("implicit", "euler")))
     whole |= launched(monkeypatch, precision, "implicit", {**WARM, "fluid.noise_tolerance": 1e-3})
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
+    free = {"body.enabled": False, "flagella.count": 1, "fluid.temperature": 300.0}
+    reduced |= launched(monkeypatch, precision, "implicit", free)
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)

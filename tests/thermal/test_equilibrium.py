@@ -40,7 +40,8 @@ def expected_energy(scene: Scene) -> np.ndarray:
         u = np.linspace(0.0, 40 * KT / scene.hook.stiffness, 100_000)
         weight = np.exp(-2 * scene.hook.stiffness * u / KT) / (1 + u) ** 2
         bend[0] = np.sum(weight * 2 * scene.hook.stiffness * u) / np.sum(weight) / KT
-    return sum(JOINT * [n - 1, n - 1, n] + HOOK + bend for n in segments)
+    hook = HOOK if scene.body.enabled else np.zeros(3)
+    return sum(JOINT * [n - 1, n - 1, n] + hook + bend for n in segments)
 
 
 def mean_energies(sim: Simulation, scene: Scene, start: float, interval: float, frames: int) -> Any:
@@ -63,6 +64,15 @@ def test_energies_are_those_of_boltzmann(step, count, mode, hook, precision, dev
         values |= {"flagella.opening_angle": 110.0, "flagella.on_axis": True}
     sim, scene = ensemble(values, precision, 64, device)
     mean, error = mean_energies(sim, scene, 8e-4 if hook else max(20 * step, 1e-4), 2 * step, 40)
+    assert np.all(error < 0.03)
+    assert np.all(abs(mean - 1) < ERRORS * error)
+
+
+@pytest.mark.parametrize("mode", ["none", "all"])
+def test_a_free_filament_has_them_too(mode, device):
+    values = {"numerics.time_step": 1e-5, "flagella.count": 1, "hydrodynamics.mode": mode, "body.enabled": False}
+    sim, scene = ensemble(values, "float64", 64, device)
+    mean, error = mean_energies(sim, scene, 2e-4, 2e-5, 30)
     assert np.all(error < 0.03)
     assert np.all(abs(mean - 1) < ERRORS * error)
 

@@ -24,6 +24,7 @@ from warpflag_kernels.implicit import (
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
 from warpflag_kernels.stepping import health
+from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag_kernels.thermal import additive_chart, equilibrium, strain_gradients
 
@@ -75,6 +76,9 @@ class ThermalStepper:
 
     def __init__(self, system: System, scenes: Sequence[Scene], explicit: bool) -> None:
         self._system, self._explicit = system, explicit
+        # Between its ends the path of a step is unknown: frames are ends of steps.
+        self.dense: DenseOutput | None = None
+        self.ends_at_frames = True
         model = system.model
         p, device = model.precision, model.device
         energies = [thermal_energy(scene) for scene in scenes]

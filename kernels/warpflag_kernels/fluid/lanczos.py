@@ -170,16 +170,17 @@ def _root(p: Precision) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
+def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Noise, Lanczos = noise_stage.struct(p), struct(p)
     normals, root = random_numbers.functions(p).normals, _root(p)
-    self_mobility = noise_stage.functions(p, pairs).self_mobility
+    self_mobility = noise_stage.functions(p, True).self_mobility
     drag_velocity = node_velocity.local(p).drag_velocity
     most, fixed, for_pairs = wp.constant(MOST_PRODUCTS), wp.constant(PRODUCTS), wp.constant(random_numbers.PAIRS)
     exhausted = wp.constant(wp.float64(EXHAUSTED))
-    module = p.module("lanczos")
+    vec6 = wp.types.vector(6, real)
+    module = p.module("lanczos", "free" if free else "")
 
     @wp.kernel(module=module)
     def begin(
@@ -202,8 +203,9 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             e = model.first_node[k]
-            z.basis[e] = vec3(real(0.0))
-            e += 1
+            if wp.static(not free):  # r_0 moves with the body
+                z.basis[e] = vec3(real(0.0))
+                e += 1
             while e < model.first_node[k + 1]:
                 xi = normals(noise.seed[c], e - begin_node, steps[c], for_pairs)
                 v = vec3(xi[0], xi[1], xi[2])
@@ -235,6 +237,8 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         c = model.cell_of[e]
         if state.active[c] != 0 and z.running[c] != 0:
             state.force[e] = z.basis[z.products[c] * model.cell_of.shape[0] + e]
+            if wp.static(free) and e == model.first_node[model.flagellum_of[e]]:
+                state.body_velocity[c] = vec3(real(0.0))  # only the flow of the others is asked for
 
     @wp.kernel(module=module)
     def advance(
@@ -260,6 +264,11 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         while k < model.first_flagellum[c + 1]:
             e = model.first_node[k]
             z.basis[here + count + e] = vec3(real(0.0))
+            if wp.static(free):
+                q = z.basis[here + e]
+                w = state.velocity[e] + own * q
+                z.basis[here + count + e] = w
+                alpha += wp.float64(wp.dot(q, w))
             e += 1
             while e < model.first_node[k + 1]:
                 q = z.basis[here + e]
@@ -332,7 +341,11 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         for j in range(z.products[c]):
             total += real(z.weight[c * most + j]) * z.basis[j * count + e]
         scale = real(wp.sqrt(wp.float64(2.0) * noise.energy[c] / step[c]) * z.size[c])
-        noise.node[e] = noise.node[e] + scale * vec4(total[0], total[1], total[2], real(0.0))
+        if wp.static(free) and e == model.first_node[model.flagellum_of[e]]:
+            none = real(0.0)
+            noise.body[c] = noise.body[c] + scale * vec6(total[0], total[1], total[2], none, none, none)
+        else:
+            noise.node[e] = noise.node[e] + scale * vec4(total[0], total[1], total[2], real(0.0))
 
     return SimpleNamespace(begin=begin, load=load, advance=advance, look=look, combine=combine)
 
@@ -354,7 +367,12 @@ def draw_pairs(
         process: room to work in.
         velocities: finds node velocities from forces.
     """
-    kernels, device, cells, z = _kernels(model.precision, True), model.device, model.cell_count, process.data
+    kernels, device, cells, z = (
+        _kernels(model.precision, model.switches.has("free end")),
+        model.device,
+        model.cell_count,
+        process.data,
+    )
 
     def multiply() -> None:
         wp.launch(kernels.load, model.element_count, inputs=[model.data, z, state.data], device=device)

@@ -13,7 +13,7 @@ divergence. At a node between segments e and f of tangents t_e, t_f and lengths 
     kT (mobility_along - mobility_across) [tr(G) t + G t],
     G = (1 - t t) [(1 - t_e t_e)/l_e - (1 - t_f t_f)/l_f]/|t_e + t_f|,
 
-and 2 t/l in the bracket at the last node.
+and 2 t/l in the bracket at the last node, -2 t/l at the r_0 of a free filament, which is stored as the body.
 """
 
 import functools
@@ -115,16 +115,17 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
+def _kernels(p: Precision, pairs: bool, free: bool) -> SimpleNamespace:
     real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
     Model, State, Noise = structs(p).Model, structs(p).State, struct(p)
     normals = random_numbers.functions(p).normals
     f = functions(p, pairs)
-    excess_root, drift = f.excess_root, f.drift
+    self_mobility, excess_root, drift = f.self_mobility, f.excess_root, f.drift
+    zero, two = wp.constant(real(0.0)), wp.constant(real(2.0))
     for_node, for_shift, for_turn = (
         wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
     )
-    module = p.module("noise", "pairs" if pairs else "")
+    module = p.module("noise", ("pairs" if pairs else "") + ("free" if free else ""))
 
     @wp.kernel(module=module)
     def elements(
@@ -146,6 +147,8 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         own = e - model.first_node[model.first_flagellum[c]]
         xi = normals(noise.seed[c], own, steps[c], for_node)
         spin = scale * wp.sqrt(model.drag.spin_mobility[k]) * xi[3]
+        if wp.static(free) and e == model.first_node[k]:
+            spin = zero  # there is no motor
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = scale * excess_root(model, state, e, k, c, vec3(xi[0], xi[1], xi[2]))
@@ -177,7 +180,16 @@ def _kernels(p: Precision, pairs: bool) -> SimpleNamespace:
         b = normals(noise.seed[c], 0, steps[c], for_turn)
         axis = state.pose.body_axis[c]
         body = model.body
-        u = scale * root(axis, body.mobility_along[c], body.mobility_across[c], vec3(a[0], a[1], a[2]))
+        along = body.mobility_along[c]
+        across = body.mobility_across[c]
+        v = vec3(zero)
+        if wp.static(free):
+            first = model.first_node[model.first_flagellum[c]]
+            axis = state.pose.tangent[first + 1]
+            v = (real(noise.energy[c]) * two * (across - along) / state.pose.length[first + 1]) * axis
+            along = wp.max(along - self_mobility(model, c), zero)
+            across = wp.max(across - self_mobility(model, c), zero)
+        u = v + scale * root(axis, along, across, vec3(a[0], a[1], a[2]))
         w = scale * root(axis, body.spin_mobility[c], body.tumble_mobility[c], vec3(b[0], b[1], b[2]))
         noise.body[c] = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
@@ -192,7 +204,7 @@ def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any)
         control: struct `Control`, with the step that begins and its number.
         noise: struct `Noise`.
     """
-    kernels = _kernels(model.precision, model.switches.pairs != "none")
+    kernels = _kernels(model.precision, model.switches.pairs != "none", model.switches.has("free end"))
     inputs = [model.data, state.data, control.step, control.steps, noise]
     wp.launch(kernels.elements, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.bodies, model.cell_count, inputs=inputs, device=model.device)

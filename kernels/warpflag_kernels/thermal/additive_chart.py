@@ -58,7 +58,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     Increment, Additive = chain_chart.types(p).Increment, struct(p)
@@ -66,7 +66,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
     respond = body_stage.mobility(p).respond
-    module = p.module("additive_chart")
+    module = p.module("additive_chart", "free" if free else "")
 
     @wp.kernel(module=module)
     def move_bodies(
@@ -143,7 +143,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state: State,
         a: Additive,
     ):
-        """One Newton iteration for the tensions of a flagellum, its anchor at rest; tangents are left in the pose."""
+        """One Newton iteration for the tensions of a flagellum, its anchor at rest or r_0 a free end; tangents are left
+        in the pose."""
         k = wp.tid()
         first = model.first_node[k]
         end = model.first_node[k + 1]
@@ -165,6 +166,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
             moved = respond_node(model, chart, e, k, t)
             diagonal = wp.dot(t, moved)
             beside = zero
+            if wp.static(free) and e == first + 1:
+                own = chart.base.tangent[e]
+                part = wp.dot(own, t) * own
+                moved_end = model.body.mobility_along[c] * part + model.body.mobility_across[c] * (t - part)
+                diagonal += wp.dot(t, moved_end)
             if e > first + 1:
                 diagonal += wp.dot(t, respond_node(model, chart, e - 1, k, t))
                 beside = -wp.dot(t, moved_before)  # to the tension before
@@ -292,13 +298,14 @@ def retract(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: An
         work: struct `Additive`.
         restoring: whether lengths are restored.
     """
-    kernels, device, cells = _kernels(model.precision), model.device, model.cell_count
+    free = model.switches.has("free end")
+    kernels, device, cells = _kernels(model.precision, free), model.device, model.cell_count
     flagella, elements = model.flagellum_count, model.element_count
     wp.launch(kernels.move_bodies, cells, inputs=[model.data, x, state.data, chart], device=device)
     wp.launch(kernels.displace, elements, inputs=[model.data, state.data, chart, x, work], device=device)
     for iteration in range(LENGTH_ITERATIONS if restoring else 0):
-        if iteration > 0:
-            wp.launch(kernels.pull_bodies, cells, inputs=[model.data, work, state.data, chart], device=device)
         wp.launch(kernels.restore, flagella, inputs=[model.data, chart, state.data, work], device=device)
+        if free or iteration + 1 < LENGTH_ITERATIONS:
+            wp.launch(kernels.pull_bodies, cells, inputs=[model.data, work, state.data, chart], device=device)
     wp.launch(kernels.frames, elements, inputs=[model.data, chart, x, work, state.data], device=device)
     wp.launch(kernels.tell, flagella, inputs=[model.data, state.data, x, chart], device=device)

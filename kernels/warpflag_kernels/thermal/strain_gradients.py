@@ -97,6 +97,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
     normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.STRAIN)
     module = p.module("strain_noise")
 
+    @wp.func(module=module)
+    def without_joint(model: Model, i: wp.int32, k: wp.int32):
+        """Whether there is nothing to join segment i and the next: at the tripod of a free filament."""
+        return i == model.first_node[k] and model.rod.hook_rigidity[k] == real(0.0)
+
     @wp.kernel(module=module)
     def stiffnesses(
         # Model:
@@ -114,7 +119,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             t = state.pose.tangent[i]
             per_length = model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
             stiffness.stretch[i] = per_length * wp.outer(t, t)
-        if i + 1 == model.first_node[k + 1]:
+        if i + 1 == model.first_node[k + 1] or without_joint(model, i, k):
             return
         on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
         s = joint_stiffness(model, i, k)
@@ -143,22 +148,31 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Out:
         state: State,
     ):
-        """Adds random moments at every joint and the random tension of the segment after it to the gradients."""
+        """Adds random moments at every joint, and random tensions of segments, to the gradients of the joints."""
         i = wp.tid()
         c = model.cell_of[i]
         if state.active[c] == 0:
             return
         k = model.flagellum_of[i]
-        if i + 1 == model.first_node[k + 1]:
+        last = model.first_node[k + 1] - 1
+        if i == last or without_joint(model, i, k):
             return
-        xi = normals(noise.seed[c], i - model.first_node[model.first_flagellum[c]], steps[c], for_strain)
+        own = i - model.first_node[model.first_flagellum[c]]
+        xi = normals(noise.seed[c], own, steps[c], for_strain)
         scale = share * real(wp.sqrt(noise.energy[c]))
         on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
         s = joint_stiffness(model, i, k)
         m = scale * vec3(wp.sqrt(s[0]) * xi[0], wp.sqrt(s[1]) * xi[1], wp.sqrt(s[2]) * xi[2])
-        tension = scale * wp.sqrt(model.rod.stretching_stiffness[k] / model.rod.segment_length[k]) * xi[3]
-        state.joint_before[i] = state.joint_before[i] + wp.transpose(on_e) * m
-        state.joint_after[i] = state.joint_after[i] + wp.transpose(on_f) * m + tension * state.pose.tangent[i + 1]
+        tension = scale * wp.sqrt(model.rod.stretching_stiffness[k] / model.rod.segment_length[k])
+        before = wp.transpose(on_e) * m
+        after = wp.transpose(on_f) * m
+        if i > model.first_node[k]:
+            before += (tension * xi[3]) * state.pose.tangent[i]
+        if i + 1 == last:  # no joint begins with the last segment
+            xi = normals(noise.seed[c], own + 1, steps[c], for_strain)
+            after += (tension * xi[3]) * state.pose.tangent[last]
+        state.joint_before[i] = state.joint_before[i] + before
+        state.joint_after[i] = state.joint_after[i] + after
         state.joint_spin_before[i] = state.joint_spin_before[i] + wp.dot(m, spin_e)
         state.joint_spin_after[i] = state.joint_spin_after[i] + wp.dot(m, spin_f)
 
