@@ -75,7 +75,7 @@ class Draws:
         if self._anchors is not None:
             for k, (azimuth, offset) in enumerate(self._placed(with_values(scene, values), draw, repeat)):
                 values |= {f"flagellum.{k}.azimuth": azimuth, f"flagellum.{k}.anchor_offset": offset}
-        if hasattr(scene.fluid, "seed") and (draw or repeat):
+        if scene.fluid.temperature > 0.0 and (draw or repeat):
             values["fluid.seed"] = int(self._stream("fluid.seed", draw, repeat).integers(2**31))
         return values
 
