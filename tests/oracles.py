@@ -117,6 +117,21 @@ def contact_distances(start: InitialState) -> np.ndarray:
     return np.concatenate(found)
 
 
+def own_distances(scene: Scene, start: InitialState) -> list[np.ndarray]:
+    """Distances of pairs of segments of one flagellum [um], infinite where they are neighbours, [N, N] each.
+
+    Neighbours are less than two segments, or not more than 3 sigma of contour, apart; every pair stands once.
+    """
+    diameter = 4 * scene.flagella.filament_radius if scene.steric.diameter is None else scene.steric.diameter
+    found = []
+    for spec, x in zip(scene.resolved_flagella(), start.positions, strict=True):
+        distances = segment_distances(x[:-1], np.diff(x, axis=0), x[:-1], np.diff(x, axis=0))
+        between = np.arange(len(distances)) - np.arange(len(distances))[:, None]
+        apart = (between >= 2) & (between * spec.segment_length > 3 * diameter)
+        found.append(np.where(apart, distances, np.inf))
+    return found
+
+
 def steric_energy(scene: Scene, start: InitialState) -> float:
     """Energy of the contacts between flagella and of nodes r_1..r_N with the body, where the scene has them."""
     strength = scene.steric.strength
@@ -124,6 +139,8 @@ def steric_energy(scene: Scene, start: InitialState) -> float:
     total = 0.0
     if scene.steric.enabled:
         total += steric_potential(contact_distances(start), strength, diameter).sum()
+    if scene.steric.enabled and scene.steric.self_contact:
+        total += sum(steric_potential(r, strength, diameter).sum() for r in own_distances(scene, start))
     if scene.body.contact:
         nodes = np.concatenate([x[1:] for x in start.positions])
         total += steric_potential(body_gaps(scene, start, nodes), strength, diameter).sum()

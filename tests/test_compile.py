@@ -32,6 +32,7 @@ SWITCHES = {
     "hook": {"hook.stiffness": 0.65},
     "free": {"body.enabled": False, "flagella.count": 1},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
+    "self": {"steric.self_contact": True},
 }
 STEPPERS = ("rkc", "euler", "implicit")
 WARM = {"fluid.temperature": 300.0, "hook.stiffness": 4.0}  # steps with thermal noise: implicit and explicit
@@ -43,6 +44,8 @@ VARIANTS = [
     ("rkc", "none"),
     ("rkc", "short"),
     ("rkc", "external"),
+    ("rkc", "self"),
+    ("implicit", "self"),
     ("implicit", "none"),
     ("implicit", "hook"),
     ("rkc", "free"),

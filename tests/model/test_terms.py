@@ -116,6 +116,18 @@ def test_a_single_flagellum_has_no_partner(monkeypatch):
     assert variants_of(launches(between, monkeypatch), "mobility") == {"none_none"}
 
 
+def test_contact_with_itself_has_kernels_of_its_own_and_only_then(monkeypatch):
+    def with_self(values: dict[str, Any], by_cells: bool) -> set[str]:
+        found = launches(cell({"numerics.stepper": "implicit", **values}), monkeypatch, by_cells)
+        return {kernel.module.name.split(".")[1] for kernel in found if "self" in kernel.module.name}
+
+    for by_cells in (False, True):
+        assert not with_self({}, by_cells) and not with_self({"flagella.count": 1}, by_cells)
+        alone = with_self({"steric.self_contact": True, "flagella.count": 1}, by_cells)
+        assert alone == with_self({"steric.self_contact": True}, by_cells) >= {"contact_search", "health", "neighbours"}
+        assert not with_self({"steric.self_contact": True, "steric.enabled": False}, by_cells)
+
+
 @pytest.mark.parametrize("stepper", ["rkc", "euler", "implicit"])
 def test_a_stepper_brings_only_its_own_kernels(stepper, monkeypatch):
     stages = stages_of(launches(cell({"numerics.stepper": stepper}), monkeypatch))

@@ -252,15 +252,15 @@ def sampled(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def place(sim: Simulation, nodes: np.ndarray) -> None:
     data = sim.system.state.data
-    lengths = np.ones((COUNT, 2, 3))
+    lengths = np.ones(nodes.shape[:3])
     segments = np.diff(nodes, axis=2)
     lengths[:, :, 1:] = np.linalg.norm(segments, axis=-1)
-    tangents = np.tile([0.0, 0.0, 1.0], (COUNT, 2, 3, 1))
+    tangents = np.tile([0.0, 0.0, 1.0], (*nodes.shape[:3], 1))
     tangents[:, :, 1:] = segments / lengths[:, :, 1:, None]
     data.pose.position.assign(nodes.reshape(-1, 3))
     data.pose.length.assign(lengths.ravel())
     data.pose.tangent.assign(tangents.reshape(-1, 3))
-    data.pose.director.assign(np.tile([1.0, 0.0, 0.0], (6 * COUNT, 1)))
+    data.pose.director.assign(np.tile([1.0, 0.0, 0.0], (lengths.size, 1)))
     data.active.fill_(1)
 
 

@@ -87,7 +87,7 @@ def test_a_right_hand_side_at_once_is_its_stages(terms, active, precision, devic
 
     found = []
     for launch in (lambda: launch_right_hand_side(model, state), by_stages):
-        if model.switches.has("steric"):
+        if model.switches.steric:
             state.neighbours.position.fill_(1e30)  # lists are to be made anew
         found.append(written(state.data, FOUND, launch))
     check(sim, *found, first=bool(active[0]))

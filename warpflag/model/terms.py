@@ -95,7 +95,8 @@ SCENE_TERMS = (
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque and scene.body.enabled),
     SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),
-    SceneTerm("steric", lambda scene: scene.steric.enabled and _several(scene)),
+    SceneTerm("steric", lambda scene: scene.steric.enabled and not scene.steric.self_contact and _several(scene)),
+    SceneTerm("steric with self", lambda scene: scene.steric.enabled and scene.steric.self_contact),
     SceneTerm("body contact", lambda scene: scene.body.contact and scene.body.enabled),
     SceneTerm(
         "external",

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW, PARALLEL
+from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW, OWN_SPACING, PARALLEL
 
 from warpflag.observables.arrays import Array, flagella
 
-__all__ = ["closest_parameters", "steric_force", "steric_force_density"]
+__all__ = ["closest_parameters", "own_spacing", "steric_force", "steric_force_density"]
 
 
 def steric_force(distance: ArrayLike, strength: float, diameter: float) -> Array:
@@ -61,6 +61,16 @@ def closest_parameters(p: Array, d: Array, q: Array, e: Array) -> tuple[Array, A
     return s, np.clip(t, 0.0, 1.0)
 
 
+def own_spacing(diameter: float, segment_length: float) -> int:
+    """How many numbers two segments of one flagellum must be apart to touch: 2, and more than 3 sigma of contour.
+
+    Args:
+        diameter: sigma [um].
+        segment_length: h [um].
+    """
+    return max(2, int(OWN_SPACING * diameter / segment_length) + 1)
+
+
 def steric_force_density(
     positions: ArrayLike,
     first_node: NDArray[np.integer],
@@ -68,14 +78,17 @@ def steric_force_density(
     diameter: float,
     length: float,
     rule: Literal["pairs", "nodes", "net"] = "pairs",
+    *,
+    self_contact: bool = False,
 ) -> float:
     """Steric force density of one frame [pN/um]: the paper's f_c = |F_s|/L, whose counting it does not print.
 
-    Every pair of segments of two flagella within the cutoff acts, by (1 - s) on its first and s on its second node.
-    The rules: "pairs" sums |F| over the pairs, each once, so a contact near a vertex counts up to four times (records
-    hold this one); "nodes" sums the magnitudes of the forces on the nodes of a flagellum, in which forces from opposite
-    sides cancel; "net" is the magnitude of the summed force on a flagellum. The last two are means over the flagella.
-    None of them converges with the segment length: compare shapes, not values.
+    Every pair of segments of two flagella, or of one where that is in contact with itself, within the cutoff acts, by
+    (1 - s) on its first and s on its second node. The rules: "pairs" sums |F| over the pairs, each once, so a contact
+    near a vertex counts up to four times (records hold this one); "nodes" sums the magnitudes of the forces on the
+    nodes of a flagellum, in which forces from opposite sides cancel; "net" is the magnitude of the summed force on a
+    flagellum. The last two are means over the flagella. None of them converges with the segment length: compare shapes,
+    not values.
 
     Args:
         positions: nodes [um], shape [node_count, 3].
@@ -84,17 +97,20 @@ def steric_force_density(
         diameter: sigma [um].
         length: L [um].
         rule: how forces are counted.
+        self_contact: whether segments of one flagellum repel, more than 3 sigma of contour apart.
     """
     positions = np.asarray(positions, float)
     forces, total = np.zeros_like(positions), 0.0
     parts = list(flagella(first_node))
-    for a, b in combinations(parts, 2):
+    for a, b in combinations_with_replacement(parts, 2) if self_contact else combinations(parts, 2):
         p, q = positions[a], positions[b]
         d, e = np.diff(p, axis=0), np.diff(q, axis=0)
         s, t = closest_parameters(p[:-1, None], d[:, None], q[None, :-1], e[None])
         gap = p[:-1, None] + s[..., None] * d[:, None] - q[None, :-1] - t[..., None] * e[None]
         distance = np.linalg.norm(gap, axis=-1)
         magnitude = steric_force(distance, strength, diameter)
+        if a is b:
+            magnitude = np.triu(magnitude, own_spacing(diameter, float(np.linalg.norm(d, axis=1).mean())))
         total += float(magnitude.sum())
         force = (magnitude / np.maximum(distance, np.finfo(float).tiny))[..., None] * gap
         for rows, share, sign, axis in ((a, s, 1.0, 1), (b, t, -1.0, 0)):

@@ -75,7 +75,9 @@ def steric_force_densities(record: Record, rule: Literal["pairs", "nodes", "net"
     diameter = 4.0 * scene.flagella.filament_radius if given is None else given
     length = float(np.mean([spec.length for spec in scene.resolved_flagella()]))
     law = scene.steric.strength, diameter, length
-    return np.array([contact.steric_force_density(x, first_node, *law, rule) for x in record.positions[:]])
+    own = scene.steric.self_contact
+    frames = record.positions[:]
+    return np.array([contact.steric_force_density(x, first_node, *law, rule, self_contact=own) for x in frames])
 
 
 def strains(record: Record, flagellum: int = 0) -> Array:

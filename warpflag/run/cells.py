@@ -106,7 +106,7 @@ class CellsReader:
         if model.switches.has("hook"):
             hook.add_energy(model, state, self._energy)
         steric_force = np.zeros(model.cell_count)
-        if model.switches.has("steric"):
+        if model.switches.steric:
             pair_forces.steric_magnitudes(model, state, self._force)
             steric_force = 0.5 * self._sums(self._force)
         state.data.active.zero_()

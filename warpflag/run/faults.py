@@ -19,7 +19,7 @@ __all__ = ["NumericalError", "found_faults", "likely_causes"]
 _ADVICE = {
     Fault.NOT_FINITE: ("a value is not finite", "take a start that is finite, or numerics.stepper = rkc"),
     Fault.CROSSING: (
-        "its centre line touches or has passed through another flagellum's",
+        "its centre line touches or has passed through another flagellum's, or itself",
         "take hydrodynamics.mode other than as_printed, or a lower motor.torque",
     ),
     Fault.STRAIN: (

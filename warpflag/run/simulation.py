@@ -340,7 +340,7 @@ class Simulation:
         carried = {"control.time": control.time, "control.steps": control.steps}
         carried |= {f"chart.base_{name}": getattr(chart.base, name) for name in _KEPT_POSE}
         carried |= {f"chart.{name}": getattr(chart, name) for name in _KEPT_CHART}
-        if self.system.model.switches.has("steric"):
+        if self.system.model.switches.steric:
             carried["guard.position"] = self.system.guard.position
         return carried
 

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from warpflag.observables.contact import own_spacing
 from warpflag.record import Record
 from warpflag.scene import Scene
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
@@ -131,7 +132,10 @@ class Coloring:
             return nearest_phase_difference(positions, self.record.directors[frames], first_node)
         steric = self.scene.steric
         diameter = 4.0 * self.record.filament_radius if steric.diameter is None else steric.diameter
-        return contact_load(positions, first_node, steric.strength if steric.enabled else 0.0, diameter)
+        strength = steric.strength if steric.enabled else 0.0
+        lengths = [spec.segment_length for spec in self.scene.resolved_flagella()]
+        own = np.array([own_spacing(diameter, h) for h in lengths]) if steric.self_contact else None
+        return contact_load(positions, first_node, strength, diameter, own)
 
     def colors(self, values: ArrayLike) -> NDArray[np.float32]:
         """Linear RGB of values, shape [..., 3]; grey where they are undefined."""

@@ -85,7 +85,13 @@ def nearest_phase_difference(positions: Array, directors: Array, first_node: NDA
     return np.concatenate([theta[:, : counts[k], k] for k in range(len(counts))], axis=1)
 
 
-def contact_load(positions: Array, first_node: NDArray[np.integer], strength: float, diameter: float) -> Array:
+def contact_load(
+    positions: Array,
+    first_node: NDArray[np.integer],
+    strength: float,
+    diameter: float,
+    own_spacing: NDArray[np.integer] | None = None,
+) -> Array:
     """Steric load of each node [pN], shape [frame, node].
 
     It is the node's shares of |F| from every contact between segments of different flagella.
@@ -99,6 +105,8 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
         first_node: shape [flagellum_count + 1].
         strength: F_0 [pN].
         diameter: sigma [um].
+        own_spacing: of each flagellum, how many numbers two of its own segments must be apart to touch; default: they
+            never do.
     """
     frames, nodes = positions.shape[:2]
     is_segment = np.ones(nodes, dtype=bool)
@@ -107,7 +115,8 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
     flagellum = np.repeat(np.arange(len(first_node) - 1), np.diff(first_node))[last]
     starts, vectors = positions[:, last - 1], positions[:, last] - positions[:, last - 1]
     longest = float(np.sqrt(np.vecdot(vectors, vectors).max()))
-    i, j = _near_pairs(starts + 0.5 * vectors, longest + CUTOFF * diameter, flagellum)
+    own = None if own_spacing is None else np.asarray(own_spacing)[flagellum]
+    i, j = _near_pairs(starts + 0.5 * vectors, longest + CUTOFF * diameter, flagellum, own)
     starts, vectors = starts.reshape(-1, 3), vectors.reshape(-1, 3)
     s, t = closest_parameters(starts[i], vectors[i], starts[j], vectors[j])
     gap = starts[i] + s[:, None] * vectors[i] - starts[j] - t[:, None] * vectors[j]
@@ -118,7 +127,9 @@ def contact_load(positions: Array, first_node: NDArray[np.integer], strength: fl
     return np.reshape(load, (frames, nodes))
 
 
-def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tuple[NDArray, NDArray]:
+def _near_pairs(
+    points: Array, reach: float, group: NDArray[np.integer], spacing: NDArray[np.integer] | None = None
+) -> tuple[NDArray, NDArray]:
     """Pairs of points of one frame that are near each other and of different groups, each pair once.
 
     Points are sorted by cell of a grid as wide as the reach; z is its fastest index, so that the cells above and below
@@ -128,6 +139,7 @@ def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tupl
         points: [um], shape [frame, count, 3].
         reach: distance below which two points are near [um].
         group: shape [count].
+        spacing: numbers from which on two points of one group make a pair, too, shape [count].
 
     Returns:
         Indices frame * count + point of the first and of the second of every pair.
@@ -148,6 +160,8 @@ def _near_pairs(points: Array, reach: float, group: NDArray[np.integer]) -> tupl
         i = np.repeat(np.arange(len(key)), counts)
         j = np.arange(len(i)) + np.repeat(begin - np.cumsum(counts) + counts, counts)
         other = group[i] != group[j]
+        if spacing is not None:
+            other |= np.abs(order[i] - order[j]) >= spacing[order[i] % count]
         i, j = i[other], j[other]
         away = points[i] - points[j]
         near = np.vecdot(away, away) < reach * reach

@@ -39,6 +39,16 @@ class Switches:
         """Whether a force term is on."""
         return term in self.terms
 
+    @property
+    def steric(self) -> bool:
+        """Whether flagella repel: each other, or each other and themselves."""
+        return self.has("steric") or self.self_contact
+
+    @property
+    def self_contact(self) -> bool:
+        """Whether a flagellum repels itself, too."""
+        return self.has("steric with self")
+
 
 @dataclass(frozen=True)
 class Plan:

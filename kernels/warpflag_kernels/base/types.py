@@ -219,7 +219,7 @@ def allocate_state(model: DeviceModel) -> Any:
     s.active = zeros(cells, wp.int32)
     s.joint_before, s.joint_after = zeros(elements, p.vec3), zeros(elements, p.vec3)
     s.joint_spin_before, s.joint_spin_after = zeros(elements, p.real), zeros(elements, p.real)
-    if model.switches.has("steric"):
+    if model.switches.steric:
         s.steric_first, s.steric_second = zeros(elements, p.vec3), zeros(elements, p.vec3)
     if model.switches.has("body contact"):
         s.body_contact = zeros(elements, p.vec3)

@@ -4,5 +4,8 @@ CUTOFF = 2.0 ** (1.0 / 6.0)
 """Distance from which on there is no force, where the Lennard-Jones force changes sign [steric diameters]."""
 LINEAR_BELOW = 0.7
 """Distance below which the force continues along its tangent, so that it stays finite [steric diameters]."""
+OWN_SPACING = 3.0
+"""Contour between two segments of one flagellum beyond which they can touch [steric diameters]: nearer along a bent
+filament than 2^(1/6) of them only where it is folded sharper than the guards allow."""
 PARALLEL = 1.0e-10
 """Square of the sine between two segments below which they count as parallel."""

@@ -1,5 +1,7 @@
 """Verlet lists: for every segment, the near segments of other flagella, valid until a node has moved by half the skin.
 
+With contact of a flagellum with itself the lists hold its own segments, too, from a spacing along the contour on.
+
 The steric force, the contact search of a step and the guard against crossings all need to know which segments are
 close. A list with a reach longer by the skin serves many passes: it is rebuilt only when some node of the cell has
 moved by more than half the skin since. A segment with more neighbours than its list has room for tests all segments
@@ -15,6 +17,7 @@ import warp as wp
 from warpflag_kernels.base.native import native
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.contact.constants import OWN_SPACING
 
 CONTACT_REACH = (
     1.5  # reach of the lists without the skin [sigma]: the cutoff 1.122 plus the search's margin, rounded up
@@ -42,7 +45,7 @@ def struct(p: Precision) -> Any:
         extent: wp.array(dtype=real)  # [K], of a flagellum around its middle node [um]
         stale: wp.array(dtype=wp.int32)  # [C], 1: the lists are no longer valid
         count: wp.array(dtype=wp.int32)  # [E], segments listed; -1: more than there is room for
-        earlier: wp.array(dtype=wp.int32)  # [E], how many of them are of earlier flagella
+        earlier: wp.array(dtype=wp.int32)  # [E], how many of them come before the segment
         segment: wp.array(dtype=wp.int32)  # [E * SLOTS]
 
     return Neighbours
@@ -51,7 +54,7 @@ def struct(p: Precision) -> Any:
 def allocate(model: DeviceModel) -> Any:
     """Arrays of the struct `Neighbours`, with lists that are not valid yet; none without steric forces."""
     p, near, device = model.precision, struct(model.precision)(), model.device
-    if not model.switches.has("steric"):
+    if not model.switches.steric:
         return near
 
     def zeros(count: int, dtype: Any) -> wp.array:
@@ -68,12 +71,18 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def functions(p: Precision) -> SimpleNamespace:
+def functions(p: Precision, with_self: bool) -> SimpleNamespace:
     """Device functions: how many candidates a segment has, which they are, and how to skip those that are far."""
     real, vec3 = p.real, p.vec3
     Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
     slots, slack = wp.constant(SLOTS), wp.constant(real(SLACK))
-    module = p.module("neighbours_functions")
+    own_spacing = wp.constant(real(OWN_SPACING))
+    module = p.module("neighbours_functions", "self" if with_self else "")
+
+    @wp.func(module=module)
+    def spacing(model: Model, k: wp.int32, c: wp.int32):
+        """Segments of flagellum k whose numbers differ by this much or more can touch."""
+        return wp.max(int(own_spacing * model.steric.diameter[c] / model.rod.segment_length[k]) + 1, 2)
 
     @wp.func(module=module)
     def candidates(model: Model, near: Neighbours, e: wp.int32):
@@ -91,15 +100,23 @@ def functions(p: Precision) -> SimpleNamespace:
             return near.segment[e * slots + i]
         j = model.first_node[model.first_flagellum[model.cell_of[e]]] + i
         k = model.flagellum_of[j]
-        if k == model.flagellum_of[e] or j == model.first_node[k]:
-            return -1
+        if wp.static(with_self):
+            if j == model.first_node[k]:
+                return -1
+            if k == model.flagellum_of[e] and wp.abs(j - e) < spacing(model, k, model.cell_of[e]):
+                return -1
+        else:
+            if k == model.flagellum_of[e] or j == model.first_node[k]:
+                return -1
         return j
 
     @wp.func(module=module)
     def first_later(model: Model, near: Neighbours, e: wp.int32):
-        """Index of the first candidate of a later flagellum."""
+        """Index of the first candidate after the segment's own flagellum, or after the segment itself."""
         if near.count[e] >= 0:
             return near.earlier[e]
+        if wp.static(with_self):
+            return e + 1 - model.first_node[model.first_flagellum[model.cell_of[e]]]
         return model.first_node[model.flagellum_of[e] + 1] - model.first_node[model.first_flagellum[model.cell_of[e]]]
 
     @wp.func(module=module)
@@ -139,20 +156,21 @@ def functions(p: Precision) -> SimpleNamespace:
         middle=middle,
         next_near=next_near,
         beside=beside,
+        spacing=spacing,
     )
 
 
 @functools.cache
-def lists(p: Precision) -> SimpleNamespace:
+def lists(p: Precision, with_self: bool) -> SimpleNamespace:
     """Device functions: whether the lists of a flagellum are outdated, the list of one segment, all of a cell."""
     real = p.real
     Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
-    middle = functions(p).middle
+    middle, spacing = functions(p, with_self).middle, functions(p, with_self).spacing
     slots, skin = wp.constant(SLOTS), wp.constant(real(SKIN))
     contact_reach = wp.constant(real(CONTACT_REACH))
     # Half a length with a tenth added, for the stretch while lists are valid and for positions rounded to float32.
     half_share = wp.constant(real(0.55))
-    module = p.module("neighbours_functions")
+    module = p.module("neighbours_functions", "self" if with_self else "")
 
     @wp.func_native(native(__file__, "near_segments", p, SLOTS=SLOTS, TESTED_AT_ONCE=TESTED_AT_ONCE))
     def list_some(
@@ -204,7 +222,19 @@ def lists(p: Precision) -> SimpleNamespace:
             k = model.first_flagellum[c]
             while k < model.first_flagellum[c + 1]:
                 if k == own:
-                    near.earlier[e] = found
+                    if wp.static(with_self):
+                        gap = spacing(model, k, c)
+                        found = list_some(
+                            near, e * slots, found, model.first_node[k] + 1, e - gap + 1,
+                            wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]), wp.float32(within),
+                        )  # fmt: skip
+                        near.earlier[e] = found
+                        found = list_some(
+                            near, e * slots, found, e + gap, model.first_node[k + 1],
+                            wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]), wp.float32(within),
+                        )  # fmt: skip
+                    else:
+                        near.earlier[e] = found
                 else:
                     begin = model.first_node[k]
                     end = model.first_node[k + 1]
@@ -238,10 +268,11 @@ def lists(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
     Model, State, Neighbours = structs(p).Model, structs(p).State, struct(p)
-    has_left, list_near, refresh_cell = lists(p).has_left, lists(p).list_near, lists(p).refresh_cell
-    module = p.module("neighbours")
+    listing = lists(p, with_self)
+    has_left, list_near, refresh_cell = listing.has_left, listing.list_near, listing.refresh_cell
+    module = p.module("neighbours", "self" if with_self else "")
 
     @wp.kernel(module=module)
     def measure(
@@ -300,7 +331,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 def refresh(model: DeviceModel, state: DeviceState) -> None:
     """Makes the lists valid at the current positions: rebuilds those of cells in which a node has moved too far."""
-    kernels, near, device = _kernels(model.precision), state.neighbours, model.device
+    kernels = _kernels(model.precision, model.switches.self_contact)
+    near, device = state.neighbours, model.device
     inputs = [model.data, state.data, near]
     if model.plan.by_cells:
         wp.launch(kernels.refresh_cells, model.cell_count, inputs=inputs, device=device)

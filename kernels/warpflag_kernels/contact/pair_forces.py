@@ -1,4 +1,4 @@
-"""Contact forces: segment against segment of different flagella, node against the body surface.
+"""Contact forces: segment against segment of other flagella or of its own, node against the body surface.
 
 Every pair of segments within the cutoff acts, so a contact near a vertex counts up to four times. A force at
 parameter t of a segment acts by (1 - t) on its first and t on its second node: force and torque are conserved
@@ -8,6 +8,7 @@ thread that does a whole cell takes every pair once for both sides instead, for 
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -19,20 +20,20 @@ from warpflag_kernels.contact.constants import CUTOFF
 
 
 @functools.cache
-def gathers(p: Precision) -> SimpleNamespace:
+def gathers(p: Precision, with_self: bool) -> SimpleNamespace:
     """Device functions: forces on one segment from others, on all of a cell, and of the body on one node."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Neighbours = neighbours.struct(p)
-    law, near_by = steric.functions(p), neighbours.functions(p)
+    law, near_by = steric.functions(p), neighbours.functions(p, with_self)
     steric_force, nearest, direction, off_axis = law.steric_force, law.nearest, law.direction, law.off_axis
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
     cutoff = real(CUTOFF)
-    module = p.module("pair_forces_functions")
+    module = p.module("pair_forces_functions", "self" if with_self else "")
 
     @wp.func(module=module)
     def pairs_of(model: Model, state: State, near: Neighbours, e: wp.int32):
-        """Forces on the first and second node of segment e from segments of other flagella, and the sum of |F|."""
+        """Forces on the first and second node of segment e from other segments, and the sum of |F|."""
         strength = model.steric.strength[model.cell_of[e]]
         diameter = model.steric.diameter[model.cell_of[e]]
         first = vec3(real(0.0))
@@ -127,11 +128,11 @@ def gathers(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _segment_functions(p: Precision) -> SimpleNamespace:
-    """Device functions of the term of contact between flagella."""
+def _segment_functions(p: Precision, with_self: bool) -> SimpleNamespace:
+    """Device functions of the term of contact between flagella, each with itself too or not."""
     vec3, Model, State, Neighbours = p.vec3, structs(p).Model, structs(p).State, neighbours.struct(p)
-    refresh_cell, pairs_of_cell = neighbours.lists(p).refresh_cell, gathers(p).pairs_of_cell
-    module = p.module("pair_forces_functions")
+    refresh_cell, pairs_of_cell = neighbours.lists(p, with_self).refresh_cell, gathers(p, with_self).pairs_of_cell
+    module = p.module("pair_forces_functions", "self" if with_self else "")
 
     @wp.func(module=module)
     def in_cell(model: Model, state: State, near: Neighbours, c: wp.int32):
@@ -153,7 +154,7 @@ def _segment_functions(p: Precision) -> SimpleNamespace:
 def _body_functions(p: Precision) -> SimpleNamespace:
     """Device functions of the term of contact with the body."""
     vec3, Model, State = p.vec3, structs(p).Model, structs(p).State
-    body_force = gathers(p).body_force
+    body_force = gathers(p, False).body_force
     module = p.module("pair_forces_functions")
 
     @wp.func(module=module)
@@ -183,12 +184,12 @@ def _body_functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
-    real = p.real
+def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
+    real, variant = p.real, "self" if with_self else ""
     Model, State, Neighbours = structs(p).Model, structs(p).State, neighbours.struct(p)
-    pairs_of, body_force = gathers(p).pairs_of, gathers(p).body_force
+    pairs_of = gathers(p, with_self).pairs_of
 
-    @wp.kernel(module=p.module("steric"))
+    @wp.kernel(module=p.module("steric", variant))
     def segments(
         # Model:
         model: Model,
@@ -204,7 +205,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         state.steric_first[e] = first
         state.steric_second[e] = second
 
-    @wp.kernel(module=p.module("steric_measure"))
+    @wp.kernel(module=p.module("steric_measure", variant))
     def magnitudes(
         # Model:
         model: Model,
@@ -222,6 +223,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
             _first, _second, total = pairs_of(model, state, near, e)
         magnitude_out[e] = total
 
+    return SimpleNamespace(segments=segments, magnitudes=magnitudes)
+
+
+@functools.cache
+def _body_kernel(p: Precision) -> Any:
+    Model, State, body_force = structs(p).Model, structs(p).State, gathers(p, False).body_force
+
     @wp.kernel(module=p.module("steric_body"))
     def body(
         # Model:
@@ -235,19 +243,20 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         state.body_contact[e] = body_force(model, state, e, c)
 
-    return SimpleNamespace(segments=segments, magnitudes=magnitudes, body=body)
+    return body
 
 
 def segment_contact(model: DeviceModel, state: DeviceState) -> None:
     """Steric forces between flagella, per segment, into `steric_first` and `steric_second` [pN]."""
     neighbours.refresh(model, state)
     inputs = [model.data, state.neighbours, state.data]
-    wp.launch(_kernels(model.precision).segments, model.element_count, inputs=inputs, device=model.device)
+    kernel = _kernels(model.precision, model.switches.self_contact).segments
+    wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
 
 
 def body_contact(model: DeviceModel, state: DeviceState) -> None:
     """Contact force of the body on each node r_1..r_N, into `body_contact` [pN]."""
-    kernel = _kernels(model.precision).body
+    kernel = _body_kernel(model.precision)
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -256,8 +265,12 @@ def steric_magnitudes(model: DeviceModel, state: DeviceState, magnitude_out: wp.
     sides."""
     neighbours.refresh(model, state)
     inputs = [model.data, state.data, state.neighbours, magnitude_out]
-    wp.launch(_kernels(model.precision).magnitudes, model.element_count, inputs=inputs, device=model.device)
+    kernel = _kernels(model.precision, model.switches.self_contact).magnitudes
+    wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
 
 
-STERIC = Term("steric", launch=segment_contact, functions=_segment_functions, contact=True)
+STERIC = Term("steric", launch=segment_contact, functions=lambda p: _segment_functions(p, False), contact=True)
+STERIC_WITH_SELF = Term(
+    "steric with self", launch=segment_contact, functions=lambda p: _segment_functions(p, True), contact=True
+)
 BODY_CONTACT = Term("body contact", launch=body_contact, functions=_body_functions, contact=True)

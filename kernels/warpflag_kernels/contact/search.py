@@ -21,19 +21,20 @@ REACH = CUTOFF + MARGIN  # largest gap of a listed pair [sigma]
 
 
 @functools.cache
-def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
+def _kernels(p: Precision, segments: bool, body: bool, with_self: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Pose, Contacts = structs(p).Model, structs(p).State, structs(p).Pose, contact_list.struct(p)
     Neighbours = neighbours.struct(p)
     law = steric.functions(p)
     nearest, direction, off_axis = law.nearest, law.direction, law.off_axis
-    near_by = neighbours.functions(p)
+    near_by = neighbours.functions(p, with_self)
     candidates, candidate, first_later, beside = (
         near_by.candidates, near_by.candidate, near_by.first_later, near_by.beside,
     )  # fmt: skip
     all_slots, all_asked = wp.constant(neighbours.SLOTS), wp.constant(wp.uint64(2**64 - 1))
     reach_factor = real(REACH)
-    module = p.module("contact_search", ("segments" if segments else "") + ("body" if body else ""))
+    parts = [name for name, on in (("segments", segments), ("body", body), ("self", with_self)) if on]
+    module = p.module("contact_search", "".join(parts))
 
     @wp.func(module=module)
     def set_pair(
@@ -66,7 +67,7 @@ def _kernels(p: Precision, segments: bool, body: bool) -> SimpleNamespace:
         room: wp.int32,
         asked: wp.uint64,
     ):
-        """Lists the contacts of element e with segments of later flagella and with the body, from `start` on.
+        """Lists the contacts of element e with later segments and with the body, from `start` on.
 
         Returns how many there are, listed only if there is room, and a bit for each candidate that is one. Of at most
         64 candidates those whose bit is set in `asked` are tested, of more candidates all.
@@ -309,9 +310,9 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
         pose: the pose of `state`.
         contacts_out: struct `Contacts`.
     """
-    if model.switches.has("steric"):
+    if model.switches.steric:
         neighbours.refresh(model, state)
-    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
+    kernels = _kernels_of(model)
     inputs, device = [model.data, state.data, pose, state.neighbours, contacts_out], model.device
     if model.plan.by_cells:
         wp.launch(kernels.list_cells, model.cell_count, inputs=inputs, device=device)
@@ -324,6 +325,10 @@ def find(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -
 
 def renew(model: DeviceModel, state: DeviceState, pose: Any, contacts_out: Any) -> None:
     """Closest points, gaps and normals of the listed contacts in another pose; arguments as in `find`."""
-    kernels = _kernels(model.precision, model.switches.has("steric"), model.switches.has("body contact"))
     inputs = [model.data, state.data, pose, contacts_out]
-    wp.launch(kernels.renew, model.element_count, inputs=inputs, device=model.device)
+    wp.launch(_kernels_of(model).renew, model.element_count, inputs=inputs, device=model.device)
+
+
+def _kernels_of(model: DeviceModel) -> SimpleNamespace:
+    switches = model.switches
+    return _kernels(model.precision, switches.steric, switches.has("body contact"), switches.self_contact)

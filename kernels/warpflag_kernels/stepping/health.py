@@ -77,7 +77,7 @@ def allocate(model: DeviceModel, chart: Any) -> Any:
     """Arrays of the struct `Guard`; the start of the chart counts as checked."""
     g = struct(model.precision)()
     g.interval = wp.ones(model.cell_count, dtype=wp.int32, device=model.device)
-    if model.switches.has("steric"):
+    if model.switches.steric:
         g.position = wp.clone(chart.base.position)
         g.longest, g.moved, g.strayed, g.shifted = (
             wp.zeros(model.flagellum_count, dtype=model.precision.real, device=model.device) for _ in range(4)
@@ -86,15 +86,15 @@ def allocate(model: DeviceModel, chart: Any) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
+def _kernels(p: Precision, listing: bool, with_self: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
     twist = rotations.functions(p).twist
     closest_parameters = steric.functions(p).closest_parameters
-    near_by = neighbours.functions(p)
+    near_by = neighbours.functions(p, with_self)
     candidates, candidate, first_later = near_by.candidates, near_by.candidate, near_by.first_later
-    beside, middle, next_near = near_by.beside, near_by.middle, near_by.next_near
+    beside, middle, next_near, spacing = near_by.beside, near_by.middle, near_by.next_near, near_by.spacing
     Neighbours, skin = neighbours.struct(p), wp.constant(real(neighbours.SKIN))
     Contacts, listed_reach = contact_list.struct(p), wp.constant(real(search.REACH))
     contact_reach = wp.constant(real(neighbours.CONTACT_REACH))
@@ -105,7 +105,7 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
-    module = p.module("health", "listing" if listing else "")
+    module = p.module("health", ("listing" if listing else "") + ("self" if with_self else ""))
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
@@ -264,7 +264,9 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
         if state.active[c] == 0 or not due(control, guard, chart, c):
             return
         k = model.flagellum_of[e]
-        if e == model.first_node[k] or k + 1 == model.first_flagellum[c + 1]:
+        if e == model.first_node[k]:
+            return
+        if wp.static(not with_self) and k + 1 == model.first_flagellum[c + 1]:
             return
         touch = touching * model.steric.diameter[c]
         if chart.commit[c] == 0:  # a start has no earlier check: no pair may touch already
@@ -306,8 +308,12 @@ def _kernels(p: Precision, listing: bool) -> SimpleNamespace:
             return
         reach = real(0.5) * state.pose.length[e] + touch + real(2.0) * moved
         other = k + 1
+        if wp.static(with_self):
+            other = k
         while other < model.first_flagellum[c + 1]:
             j = model.first_node[other] + 1
+            if wp.static(with_self) and other == k:
+                j = e + spacing(model, k, c)
             end = model.first_node[other + 1]
             while j < end:
                 if met(state, guard, e, j, moved, touch):
@@ -381,10 +387,10 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
         listed: struct `Contacts` of a search made between the last check and this one, if any.
     """
     p, listing = model.precision, listed is not None
-    kernels = _kernels(p, listing)
+    kernels = _kernels(p, listing, model.switches.self_contact)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
-    if model.switches.has("steric"):
+    if model.switches.steric:
         found = listed if listing else contact_list.struct(p)()
         moves = [model.data, state.data, state.neighbours, found, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
@@ -394,7 +400,7 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
     """Stores the checked positions, from which the next check follows the segments."""
-    if model.switches.has("steric"):
+    if model.switches.steric:
         inputs = [model.data, state.data, control, chart, guard]
-        kernel = _kernels(model.precision, False).remember
+        kernel = _kernels(model.precision, False, model.switches.self_contact).remember
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
