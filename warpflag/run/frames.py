@@ -195,7 +195,7 @@ class Frames:
         }
         before = {name: np.concatenate([self.last[name][None], arrays[name][:-1]]) for name in _MOTION}
         steric = np.zeros((m, cells))
-        if model.switches.has("steric"):
+        if model.switches.steric:
             steric = 0.5 * self._sums(read(d.steric, elements))
         block = _Block(
             counts=counts,

@@ -161,7 +161,7 @@ def _take_one(model: DeviceModel, control: Control, dense: DenseOutput) -> None:
     wp.launch(path.place_bodies, model.cell_count, inputs=[dense.data, pose], device=device)
     wp.launch(path.place_flagella, model.flagellum_count, inputs=[model.data, dense.data, pose], device=device)
     elastic.elastic_energy(model, dense.state, dense.energy)
-    if model.switches.has("steric"):
+    if model.switches.steric:
         pair_forces.steric_magnitudes(model, dense.state, dense.steric)
     inputs = [model.data, dense.state.data, dense.energy, dense.steric, dense.data]
     wp.launch(slot.store, model.element_count, inputs=inputs, device=device)

@@ -107,7 +107,7 @@ def allocate(model: DeviceModel, state: DeviceState) -> DenseOutput:
     d.body_linear, d.body_square, d.body = (zeros(cells, vec6d) for _ in range(3))
     d.step, d.body_angle = zeros(m * cells, wp.int32), zeros(m * cells, wp.float64)
     d.position, d.director, d.energy = (zeros(m * elements, p.vec3) for _ in range(3))
-    d.steric = zeros(m * elements if model.switches.has("steric") else 0, p.real)
+    d.steric = zeros(m * elements if model.switches.steric else 0, p.real)
     d.body_position, d.body_orientation = zeros(m * cells, wp.vec3d), zeros(m * cells, wp.quatd)
     d.motor_angle = zeros(m * flagella, wp.float64)
 
