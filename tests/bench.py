@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels.base.plan import Plan
-from warpflag_kernels.implicit import linear_system, linearised
+from warpflag_kernels.implicit import linearised
 from warpflag_kernels.rod import chain_chart
 
 from tests.helpers import anchors, cell, matrix, shaken
@@ -71,8 +71,8 @@ class Bench:
         band.step.fill_(step)
         band.weight.fill_(weight)
         band.singular.zero_()
-        linear_system.set_stiffness(self.model, self.state, stiffness)
-        linear_system.factorise(self.model, self.state, stiffness, band)
+        linearised.set_stiffness(self.model, self.state, stiffness)
+        linearised.factorise(self.model, self.state, stiffness, band)
         return band
 
     def force_change(self, body: Any, nodes: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,6 +31,7 @@ SWITCHES = {
     "short": {"numerics.pair_precision": "float32"},
     "hook": {"hook.stiffness": 0.65},
     "free": {"body.enabled": False, "flagella.count": 1},
+    "motor law": {"motor.law": "torque_speed"},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
     "self": {"steric.self_contact": True},
 }
@@ -46,6 +47,8 @@ VARIANTS = [
     ("rkc", "external"),
     ("rkc", "self"),
     ("implicit", "self"),
+    ("rkc", "motor law"),
+    ("implicit", "motor law"),
     ("implicit", "none"),
     ("implicit", "hook"),
     ("rkc", "free"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from warpflag_kernels.base import simd
 from warpflag_kernels.base.precision import Precision
-from warpflag_kernels.implicit import linear_system
+from warpflag_kernels.implicit import linearised
 from warpflag_kernels.rod import chain_chart
 
 from tests.bench import Bench, bench, close
@@ -48,7 +48,7 @@ def test_solutions_are_the_same(crowd):
 
     def results():
         band, y = crowd.factorise(1e-5, 0.9), crowd.increment(1.0, right)
-        linear_system.solve(crowd.model, crowd.state, band, y)
+        linearised.solve(crowd.model, crowd.state, band, y)
         return band.body_columns, band.body_block, band.body_inverse, y.body, y.node
 
     in_both_forms(crowd, results)

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 import pytest
 from warpflag_kernels.fluid import node_velocity
-from warpflag_kernels.implicit import linear_system, linearised, step_flow
+from warpflag_kernels.implicit import linearised, step_flow
 from warpflag_kernels.rod import elastic
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
@@ -241,7 +241,7 @@ def test_band_solve_is_the_dense_one(h, ablation, device, precision):
     system = dense_system(exact, step, weight)
     right = system @ x
     y = b.increment(right[:6], right[6:].reshape(-1, 4))
-    linear_system.solve(b.model, b.state, band, y)
+    linearised.solve(b.model, b.state, band, y)
     assert band.singular.numpy()[0] == 0
     # The condition of the matrix grows as h^-4, which leaves float32 two digits on the finest mesh.
     digits = max(1.0, (0.1 / h) ** 4) if precision == "float32" else 1.0
@@ -282,7 +282,7 @@ def test_linearised_equations_are_the_dense_ones_and_the_matrix_leads_to_their_s
     for _ in range(50):
         missing = inverse @ velocities - applied(x)
         y = b.increment(missing[:6], missing[6:].reshape(-1, 4))
-        linear_system.solve(b.model, b.state, band, y)
+        linearised.solve(b.model, b.state, band, y)
         x += flat(y)
     for part in parts:
         assert close(x[part], solution[part], precision, 1.0, FLOW_TOLERANCE)

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from warpflag_kernels.implicit import linear_system
+from warpflag_kernels.implicit import linearised
 
 from tests.bench import Bench
 from tests.helpers import (
@@ -71,7 +71,7 @@ def hook_part(values, precision, device):
     for stiffness in (0.65, 0.0):
         scene = cell({"flagella.length": 1.0, "hook.length": 0.055, **values, "hook.stiffness": stiffness}, precision)
         b = Bench(scene, initial_state(scene), device)
-        linear_system.set_stiffness(b.model, b.state, b.stepper.stiffness)
+        linearised.set_stiffness(b.model, b.state, b.stepper.stiffness)
         benches.append(b)
 
     def square(body, nodes):

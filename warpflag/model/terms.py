@@ -5,6 +5,8 @@ What a term does to a cell is device code, `warpflag_kernels.stepping.terms`; th
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,11 +15,14 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base.plan import Switches
 
+from warpflag.model.switching import corners
 from warpflag.record.cell_state import Evaluation
 from warpflag.scene import Scene
 from warpflag.scene.helix import rest_shape
 
 __all__ = ["SCENE_TERMS", "SceneTerm", "supplied_power", "switches_of"]
+
+_NO_KNEE = 1e30  # rate beyond any [rad/s]
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,37 @@ def _fill_motor(scenes: Sequence[Scene], precision: Any, device: Any, data: Any)
 
 def _motor_power(scene: Scene, found: Evaluation) -> float:
     """Of T_m on each tripod and -T_m m on the body."""
-    torques = np.array([spec.torque for spec in scene.resolved_flagella()])
     turns = found.spins[found.first] - found.tangents[found.first] @ found.body_spin
-    return float(torques @ turns)
+    return float(found.motor_torques @ turns)
+
+
+def _plain(scene: Scene) -> bool:
+    """Whether every motor has a constant torque."""
+    return scene.motor.switching == "none" and all(spec.law == "constant" for spec in scene.resolved_flagella())
+
+
+def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+    _fill_motor(scenes, precision, device, data)  # what the hook's stiffening goes by
+    curves, tables = [], []
+    specs = [(scene, k, spec) for scene in scenes for k, spec in enumerate(scene.resolved_flagella())]
+    for scene, k, spec in specs:
+        m, forward = scene.motor, spec.torque
+        reverse = -forward if m.reverse_torque is None else -math.copysign(m.reverse_torque, forward)
+        ends = (spec.no_load, spec.no_load if m.reverse_no_load is None else m.reverse_no_load)
+        for torque, knee, end in zip((forward, -reverse), (spec.knee, m.reverse_knee), ends, strict=True):
+            falling = spec.law == "torque_speed"
+            slope = abs(torque) / (2 * math.pi * (end - knee)) if falling else 0.0
+            curves.append((torque, 2 * math.pi * knee if falling else _NO_KNEE, slope))
+        tables.append(corners(scene, k))
+    device_array = functools.partial(wp.array, device=device)
+    m, real = data.motor, precision.real
+    m.curve = device_array(np.array(curves), dtype=precision.vec3)
+    m.prescribed = device_array(np.array([spec.law == "rate" for _, _, spec in specs], dtype=np.int32), dtype=wp.int32)
+    m.rate = device_array(np.array([2 * math.pi * spec.rate for _, _, spec in specs]), dtype=real)
+    first = np.concatenate([[0], np.cumsum([len(times) for times, _ in tables])])
+    m.first_switch = device_array(first, dtype=wp.int32)
+    m.switch_time = device_array(np.concatenate([times for times, _ in tables]), dtype=wp.float64)
+    m.switch_drive = device_array(np.concatenate([drives for _, drives in tables]), dtype=real)
 
 
 def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
@@ -91,7 +124,13 @@ def _several(scene: Scene) -> bool:
 
 
 SCENE_TERMS = (
-    SceneTerm("motor", lambda scene: scene.body.enabled, fill=_fill_motor, power=_motor_power),
+    SceneTerm("motor", lambda scene: scene.body.enabled and _plain(scene), fill=_fill_motor, power=_motor_power),
+    SceneTerm(
+        "motor law",
+        lambda scene: scene.body.enabled and not _plain(scene),
+        fill=_fill_motor_law,
+        power=_motor_power,
+    ),
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque and scene.body.enabled),
     SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),

@@ -19,7 +19,8 @@ class PowerBalance:
     """Powers at one moment [pN um/s = 1e-18 W].
 
     Attributes:
-        supplied: by the name of the force term: "motor", T_m on each tripod and -T_m m on the body; "external".
+        supplied: by the name of the force term: "motor" or, where the torque is not constant, "motor law", T_m on each
+            tripod and -T_m m on the body; "external".
         translation: dissipated by the moving nodes, the flow between them included.
         spin: dissipated by the segments' spin about their tangents.
         body: dissipated by the body's translation and rotation.
@@ -33,7 +34,7 @@ class PowerBalance:
     @property
     def motor(self) -> float:
         """Work of all motors [pN um/s]."""
-        return self.supplied.get("motor", 0.0)
+        return self.supplied.get("motor", 0.0) + self.supplied.get("motor law", 0.0)
 
     @property
     def dissipated(self) -> float:

@@ -178,10 +178,20 @@ def swimming(record: Record, start: float | None = None, stop: float | None = No
         pitch=pitch,
         phase_velocity=shape.phase_velocity(pitch, float(helix_rate.mean())),
         thrust=motion.thrust(speed, scene),
-        motor_power=float(2 * np.pi * motor_rate @ [spec.torque for spec in scene.resolved_flagella()]),
+        motor_power=_motor_power(record, scene, window, motor_rate),
         stored_power=float(energy[-1] - energy[0]) / duration,
         body_power=motion.body_power(times, body_positions, orientations, scene),
     )
+
+
+def _motor_power(record: Record, scene: Scene, window: slice, rates: Array) -> float:
+    """Mean power of all motors [pN um/s]; where torques are not constant by the trapezoidal rule over the frames."""
+    torques = record.observables.get("motor_torque")
+    if torques is None:
+        return float(2 * np.pi * rates @ [spec.torque for spec in scene.resolved_flagella()])
+    angles, torques = record.motor_angle[window], torques[window]
+    work = 0.5 * (torques[1:] + torques[:-1]) * np.diff(angles, axis=0)
+    return float(work.sum() / elapsed(record.times[window]))
 
 
 def _rows(record: Record, flagellum: int) -> slice:

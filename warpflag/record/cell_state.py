@@ -57,6 +57,7 @@ class Evaluation:
         spins: of the segments about their tangents [rad/s], shape [node_count].
         tangents: e3 of the tripod (the motor axis) and the segments, shape [node_count, 3].
         first: index of r_0 of every flagellum, shape [flagellum_count].
+        motor_torques: of the motors about their axes [pN um], shape [flagellum_count].
         supplied: power of motors and of external forces [pN um/s], by the name of the term.
         body_force: sum of the forces on the body [pN], shape [3].
         body_torque: sum of the torques on the body about its centre [pN um], shape [3].
@@ -70,6 +71,7 @@ class Evaluation:
     spins: np.ndarray
     tangents: np.ndarray
     first: np.ndarray
+    motor_torques: np.ndarray
     supplied: Mapping[str, float]
     body_force: np.ndarray
     body_torque: np.ndarray

@@ -17,7 +17,7 @@ from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.scene import Scene
 from warpflag.stepping import System
 
-__all__ = ["Cells", "CellsReader", "evaluation_of"]
+__all__ = ["Cells", "CellsReader", "evaluation_of", "motor_torques"]
 
 
 @dataclass(frozen=True)
@@ -156,6 +156,7 @@ def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -
         spins=np.repeat(model.data.drag.spin_mobility.numpy()[flagella], np.diff(first_node)) * torques,
         tangents=host(state.pose.tangent, nodes),
         first=first_node[:-1] - nodes.start,
+        motor_torques=motor_torques(system)[flagella],
         supplied={},
         body_force=host(state.flagellum_force, flagella).sum(axis=0),
         body_torque=host(state.flagellum_torque, flagella).sum(axis=0),
@@ -163,3 +164,13 @@ def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -
         body_spin=host(state.body_spin, cell),
     )
     return dataclasses.replace(found, supplied=supplied_power(scene, found))
+
+
+def motor_torques(system: System) -> np.ndarray:
+    """Torques of all motors at the state evaluated last [pN um], shape [flagellum_count]."""
+    model, state = system.model, system.state.data
+    if model.switches.has("motor law"):
+        return state.motor.torque.numpy().astype(np.float64)
+    if model.switches.has("motor"):
+        return model.data.motor.torque.numpy().astype(np.float64)
+    return np.zeros(model.flagellum_count)

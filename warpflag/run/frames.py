@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from warpflag_kernels.stepping import dense_output, frame_slots
 
+from warpflag.model.switching import corners
 from warpflag.observables.cells import body_speeds, bundle_lengths, phase_differences
 from warpflag.record import Frame
-from warpflag.run.cells import Cells
+from warpflag.run.cells import Cells, motor_torques
 from warpflag.scene import Scene
 from warpflag.stepping import Stepper, System
 
@@ -32,6 +33,7 @@ class _Block:
 
     Attributes:
         counts: how many of them each cell has, shape [cell_count].
+        motor_torque: of the motors [pN um], shape [m, flagellum_count]; empty where torques are constant.
         before: the motion at the frame before each, entry [m] of every array.
     """
 
@@ -46,6 +48,7 @@ class _Block:
     body_orientation: np.ndarray
     elastic_energy: np.ndarray
     steric_force: np.ndarray
+    motor_torque: np.ndarray
     before: Mapping[str, np.ndarray]
 
 
@@ -70,6 +73,10 @@ class Frames:
         self._durations = np.array([scene.duration for scene in scenes])
         self._counts = np.array([scene.frames for scene in scenes])
         self._lengths = [float(np.mean([spec.length for spec in scene.resolved_flagella()])) for scene in scenes]
+        counts = np.diff(self._first_flagellum).tolist()
+        self._drives: list[Any] = []  # corners of the drive of every motor, where torques are not constant
+        if system.model.switches.has("motor law"):
+            self._drives = [corners(s, k) for s, count in zip(scenes, counts, strict=True) for k in range(count)]
         self._dense: frame_slots.DenseOutput | None = None
         self._end_steps = False  # at frames
         self._wanted = np.zeros((len(scenes), 0))
@@ -127,7 +134,8 @@ class Frames:
         arrays = {name: getattr(now, name)[None] for name in (*names, "body_orientation", "elastic_energy")}
         before = {name: np.full_like(arrays[name], np.nan) for name in _MOTION}
         counts = np.ones(len(now.time), dtype=np.int64)
-        block = _Block(counts=counts, steric_force=now.steric_force[None], before=before, **arrays)
+        torque = motor_torques(self._system)[None]  # of the present state, which was evaluated last
+        block = _Block(counts=counts, steric_force=now.steric_force[None], motor_torque=torque, before=before, **arrays)
         return self._measured(block)
 
     def schedule(self, until: float | None, waiting: np.ndarray) -> bool:
@@ -197,8 +205,12 @@ class Frames:
         steric = np.zeros((m, cells))
         if model.switches.steric:
             steric = 0.5 * self._sums(read(d.steric, elements))
+        torque = np.zeros((m, 0))
+        if self._drives:
+            torque = read(d.motor_torque, model.flagellum_count).astype(np.float64)
         block = _Block(
             counts=counts,
+            motor_torque=torque,
             step=read(d.step, cells).copy(),
             positions=read(d.position, elements).astype(np.float64) + centres[:, self._cell_of_node],
             directors=read(d.director, elements).astype(np.float64),
@@ -267,6 +279,10 @@ class Frames:
             measured["phase_difference"] = phase_differences(positions, block.directors[row, nodes], first_node)
         measured["bundle_length"] = bundle_lengths(positions, first_node)
         measured["elastic_energy"] = block.elastic_energy[m, cells].sum(axis=1)
+        if self._drives:
+            measured["motor_torque"] = block.motor_torque[row, flagella]
+            pairs = zip(block.time[m, cells], flagella, strict=True)
+            measured["motor_drive"] = np.array([[np.interp(t, *self._drives[k]) for k in own] for t, own in pairs])
         before = block.before
         duration = block.time[m, cells] - before["time"][m, cells]
         at_ends = [before["body_position"][m, cells], block.body_position[m, cells]]

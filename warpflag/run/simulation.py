@@ -12,7 +12,7 @@ import warp as wp
 from warpflag_kernels.base import clock as control_stage
 from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.rod import reconstruction
-from warpflag_kernels.stepping import health
+from warpflag_kernels.stepping import evaluation_time, health
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.base.device import LAUNCHING, alone, find_device
@@ -373,11 +373,15 @@ class Simulation:
         for array in (chart.increment, chart.body_increment, chart.elapsed, chart.commit):
             array.zero_()
         reconstruction.reconstruct(self.system.model, s, chart)
+        if self.system.model.timed:
+            evaluation_time.of_stage(s, self.system.control, chart, self.device)
 
     @alone
     def _present_state(self) -> Cells:
         """The cells before any step, or after a state was set from outside."""
         self._reconstruct()
+        if self.system.model.switches.has("motor law"):
+            launch_right_hand_side(self.system.model, self.system.state)  # finds the torques of the motors
         self.system.state.data.active.zero_()
         return self.cells()
 

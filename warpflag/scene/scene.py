@@ -47,6 +47,9 @@ class FlagellumSpec:
         segment_count: number of segments.
         phase: angle of the anchor about the helix axis [deg]; None where the initial shape chooses it (see
             Flagella.phase_difference).
+        law: of the motor, as `Motor.law`.
+        knee, no_load, rate: of the motor's law [Hz].
+        switch_times: when the motor reverses by a schedule [s].
     """
 
     azimuth: float
@@ -57,6 +60,11 @@ class FlagellumSpec:
     length: float
     segment_count: int
     phase: float | None
+    law: str
+    knee: float
+    no_load: float
+    rate: float
+    switch_times: tuple[float, ...]
 
     @property
     def segment_length(self) -> float:
@@ -130,6 +138,11 @@ class Scene(Section, key=""):
                     length=length,
                     segment_count=_own(own.segments, math.floor(length / group.segment_length + 0.5)),
                     phase=own.phase,
+                    law=_own(own.law, self.motor.law),
+                    knee=_own(own.knee, self.motor.knee),
+                    no_load=_own(own.no_load, self.motor.no_load),
+                    rate=_own(own.rate, self.motor.rate),
+                    switch_times=_own(own.switch_times, self.motor.switch_times),
                 )
             )
         return tuple(specs)
@@ -204,7 +217,7 @@ class Scene(Section, key=""):
         for k, spec in enumerate(self.resolved_flagella()):
             if problems.full():
                 return
-            for check in (self._check_segments, self._check_anchor):
+            for check in (self._check_segments, self._check_anchor, self._check_motor):
                 try:
                     check(k, spec)
                 except SceneError as error:
@@ -266,6 +279,20 @@ class Scene(Section, key=""):
             key = f"flagellum.{k}.anchor_offset" if own else "flagella.anchor_offset"
             problem = f"is beyond the ends of the body, {-pole:g} to {pole:g} um"
             raise SceneError(key, spec.anchor_offset, problem, ["body.length", "body.width"])
+
+    def _check_motor(self, k: int, spec: FlagellumSpec) -> None:
+        own = self.flagellum[k] if self.flagellum else FlagellumOverride()
+        if spec.no_load <= spec.knee:
+            key = f"flagellum.{k}.no_load" if own.no_load is not None else "motor.no_load"
+            problem = f"must be above the knee, {spec.knee:g} Hz"
+            raise SceneError(key, spec.no_load, problem, ["motor.knee", f"flagellum.{k}.knee"])
+        end = spec.no_load if self.motor.reverse_no_load is None else self.motor.reverse_no_load
+        if end <= self.motor.reverse_knee:
+            problem = f"must be below the rate without load in reverse, {end:g} Hz"
+            raise SceneError("motor.reverse_knee", self.motor.reverse_knee, problem, ["motor.reverse_no_load"])
+        if self.motor.switching != "schedule" and spec.switch_times:
+            key = f"flagellum.{k}.switch_times" if own.switch_times else "motor.switch_times"
+            raise SceneError(key, spec.switch_times, "needs motor.switching = schedule", ["motor.switching"])
 
     def _check_phases(self) -> None:
         key, wanted = "flagella.phase_difference", self.flagella.phase_difference

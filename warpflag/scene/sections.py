@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from warpflag.scene.settings import Section, choice, integer, number, switch, text, vector
+from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, text, vector
+
+MOTOR_LAWS = ("constant", "torque_speed", "rate")
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,13 @@ class FlagellumOverride(Section, key="flagellum"):
         None, "deg", 0, 180, "helix axis to e_b3, toward the normal", derived="flagella.opening_angle / 2"
     )
     torque: float | None = number(None, "pN um", -1e3, 1e3, "motor torque", usual=(1e-3, 1e3), derived="motor.torque")
+    law: str | None = choice(None, MOTOR_LAWS, "as motor.law", derived="motor.law")
+    knee: float | None = number(None, "Hz", 0, 1e5, "as motor.knee", derived="motor.knee")
+    no_load: float | None = number(None, "Hz", 1e-3, 1e6, "as motor.no_load", derived="motor.no_load")
+    rate: float | None = number(None, "Hz", -1e5, 1e5, "as motor.rate", derived="motor.rate")
+    switch_times: tuple[float, ...] | None = numbers(
+        None, "s", 0, 1e6, "as motor.switch_times", derived="motor.switch_times"
+    )
     length: float | None = number(None, "um", 0.1, 100, "contour length", derived="flagella.length")
     segments: int | None = integer(
         None, 2, 10_000, "number of segments", derived="length / flagella.segment_length, rounded"
@@ -103,6 +112,15 @@ class Motor(Section, key="motor"):
     """The rotary motors and their hooks. The paper: T_m = 3.4 pN um, phi_m = 55 deg.
 
     Its text gives the body the motor torques and the forces at the anchors only (bearing_torque = false).
+
+    Laws. constant: the torque, whatever the rate. torque_speed: the torque up to the knee, from there falling in
+    proportion to zero at no_load; in reverse its own knee and end. rate: a prescribed rate relative to the body, and
+    the torque that it takes. Rates are relative to the body. Knee and end: Chen & Berg, Biophys. J. 78, 1036 (2000),
+    at 23 C; in reverse a straight line: Yuan, Fahrner, Turner & Berg, PNAS 107, 12846 (2010).
+
+    Switching. schedule: a motor reverses at every one of its switch_times. markov: a two-state Markov process for each
+    motor, all forward at first; with coupling, that share of the rates is of clocks which all motors of the cell
+    share. Rates of switching: Mears et al., eLife 3, e01916 (2014), as used in models built on it.
     """
 
     torque: float = number(
@@ -112,6 +130,24 @@ class Motor(Section, key="motor"):
     bearing_torque: bool = switch(
         True, "the body also takes the torque across the motor axis, so that the swimmer is torque-free"
     )
+    law: str = choice("constant", MOTOR_LAWS, "what sets torque and rate")
+    knee: float = number(175.0, "Hz", 0, 1e5, "rate up to which the torque is motor.torque; law torque_speed")
+    no_load: float = number(300.0, "Hz", 1e-3, 1e6, "rate at which the torque is zero, above the knee")
+    reverse_torque: float | None = number(
+        None, "pN um", 0, 1e3, "magnitude of the torque in reverse", derived="that forward"
+    )
+    reverse_knee: float = number(0.0, "Hz", 0, 1e5, "knee in reverse; 0: a straight line from the start")
+    reverse_no_load: float | None = number(
+        None, "Hz", 1e-3, 1e6, "rate in reverse at which the torque is zero", derived="motor.no_load"
+    )
+    rate: float = number(100.0, "Hz", -1e5, 1e5, "prescribed rate relative to the body; law rate")
+    switching: str = choice("none", ("none", "schedule", "markov"), "whether motors reverse during the run")
+    switch_times: tuple[float, ...] = numbers((), "s", 0, 1e6, "when every motor reverses; with schedule")
+    switch_ramp: float = number(1e-3, "s", 1e-6, 1, "time in which a motor goes from one sense to the other")
+    to_reverse: float = number(0.26, "1/s", 0, 1e5, "rate of switching to reverse; with markov")
+    to_forward: float = number(1.7, "1/s", 0, 1e5, "rate of switching back; with markov")
+    coupling: float = number(0.0, "", 0, 1, "share of the switching rates that all motors of a cell have in common")
+    seed: int = integer(0, 0, 2**31 - 1, "of the random switching")
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,16 @@
 """How a scene's settings are declared and checked.
 
 A section of a scene is a frozen dataclass derived from `Section`. Each of its fields is declared with `number`,
-`integer`, `switch`, `choice`, `text` or `vector`, and that declaration is the only place that says what the field may
-hold: the check on construction, the error text, the class's docstring and the comment in a written file all come from
-it.
+`integer`, `switch`, `choice`, `text`, `vector` or `numbers`, and that declaration is the only place that says what the
+field may hold: the check on construction, the error text, the class's docstring and the comment in a written file all
+come from it.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import itertools
 import math
 import re
 from typing import Any, ClassVar
@@ -34,7 +35,7 @@ class Setting:
     """What one field of a scene means and may hold.
 
     Attributes:
-        kind: number, integer, switch, choice, text or vector (three numbers).
+        kind: number, integer, switch, choice, text, vector (three numbers) or numbers (any count, increasing).
         meaning: what the field is.
         unit: of its numbers.
         low: least value, inclusive.
@@ -72,6 +73,7 @@ class Setting:
             "number": f"a number, {self.bounds}",
             "integer": f"a whole number, {self.bounds}",
             "vector": f"three numbers, each {self.bounds}",
+            "numbers": f"increasing numbers, each {self.bounds}",
             "switch": "true or false",
         }
         return words.get(self.kind, self.bounds)
@@ -97,6 +99,10 @@ class Setting:
             return None
         if self.kind == "vector" and isinstance(value, list | tuple) and len(value) == 3:
             return tuple(float(self._number(key, value, _plain(item))) for item in value)
+        if self.kind == "numbers" and isinstance(value, list | tuple):
+            found = tuple(float(self._number(key, value, _plain(item))) for item in value)
+            if all(a < b for a, b in itertools.pairwise(found)):
+                return found
         if self.kind == "number":
             return float(self._number(key, value, value))
         if self.kind == "integer" and isinstance(value, int):
@@ -151,14 +157,19 @@ def vector(default: tuple[float, float, float], unit: str, low: float, high: flo
     return _declared(default, Setting("vector", meaning, unit, low, high))
 
 
+def numbers(default: tuple[float, ...] | None, unit: str, low: float, high: float, meaning: str, **more: Any) -> Any:
+    """Declares a field that holds any count of increasing floats; `more` as in Setting."""
+    return _declared(default, Setting("numbers", meaning, unit, low, high, **more))
+
+
 def switch(default: bool, meaning: str) -> Any:
     """Declares a field that holds true or false."""
     return _declared(default, Setting("switch", meaning))
 
 
-def choice(default: str, choices: tuple[str, ...], meaning: str) -> Any:
-    """Declares a field that holds one of `choices`."""
-    return _declared(default, Setting("choice", meaning, choices=choices))
+def choice(default: str | None, choices: tuple[str, ...], meaning: str, **more: Any) -> Any:
+    """Declares a field that holds one of `choices`; `more` as in Setting."""
+    return _declared(default, Setting("choice", meaning, choices=choices, **more))
 
 
 def text(default: Any, meaning: str, **more: Any) -> Any:

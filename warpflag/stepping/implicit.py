@@ -18,14 +18,14 @@ from warpflag_kernels.implicit import (
     contact_solve,
     delassus,
     krylov,
-    linear_system,
     linearised,
+    motor_solve,
     quasi_newton,
     stability,
     step_flow,
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian
-from warpflag_kernels.stepping import balance, dense_output, health
+from warpflag_kernels.stepping import balance, dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 from warpflag.scene import Scene
@@ -109,7 +109,8 @@ class ImplicitStepper:
     def __init__(self, system: System, scenes: Sequence[Scene]) -> None:
         self._system = system
         model = system.model
-        self._smooth_terms = tuple(term for term in model.terms if not term.contact)
+        self._terms = tuple(term.within_step or term for term in model.terms)
+        self._smooth_terms = tuple(term for term in self._terms if not term.contact)
         self._touching = model.touching
         self.history, self._moved_history = History.allocate(model), History.allocate(model)
         self._scratch = Scratch.allocate(model)
@@ -123,6 +124,7 @@ class ImplicitStepper:
             balance.holds(model),
             balance.allocate(model),
         )
+        self._motor_law, self._motors = model.switches.has("motor law"), motor_solve.allocate(model)
         fixed = [scene.numerics.time_step for scene in scenes]
         self.steps = allocated_control(scenes, [bool(f) for f in fixed], model.device)
         # Without flows between nodes the matrix is the whole of the linearised equations.
@@ -144,6 +146,8 @@ class ImplicitStepper:
         k = collocation.kernels(model.precision, self.balanced)
         inputs = [model.data, state.data, self.steps, s.control, i, band, self.contacts, self.law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
+        if model.timed:
+            evaluation_time.within_step(state, s.control, i.theta, device)
         # The first iteration, where the last steps lead.
         inputs = [model.data, state.data, i, last, before, x.predicted]
         wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
@@ -155,8 +159,10 @@ class ImplicitStepper:
         if model.switches.pairs != "none":
             step_flow.build(model, state, self.flow, self.contacts if self._touching else None)
         self._evaluate(in_single=step_flow.stores_pairs(model))
-        linear_system.set_stiffness(model, state, self.stiffness)
-        linear_system.factorise(model, state, self.stiffness, band)
+        linearised.set_stiffness(model, state, self.stiffness)
+        linearised.factorise(model, state, self.stiffness, band)
+        if self._motor_law:
+            motor_solve.prepare(model, state, band, self._motors)
         solution = self._solve(x.last_at_first, x.zero, first=True)
         # The second, where the first one led.
         transported = (x.last_at_first, solution, x.last_at_second, x.found)
@@ -202,7 +208,7 @@ class ImplicitStepper:
         forces.total_forces(model, state, self._smooth_terms)
         if self._touching:
             contact_list.act(model, state, self.contacts, self.law.force)
-        body.body_motion(model, state)
+        body.body_motion(model, state, self._terms)
         if in_single:
             step_flow.single_velocities(model, state, self.flow)
         else:
@@ -219,7 +225,7 @@ class ImplicitStepper:
         inputs = [model.data, state.data, self.data, self.band, self.law, last, found, x.free]
         kernel = collocation.kernels(model.precision, self.balanced).right_hand_side
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
-        linear_system.solve(model, state, self.band, x.free)
+        linearised.solve(model, state, self.band, x.free)
         if self._touching:
             contact_solve.solve(
                 model, state, self.contacts, self.band, self.flow, x.free, self.law, x.solved,
@@ -227,6 +233,10 @@ class ImplicitStepper:
             )  # fmt: skip
         if self.stability is not None:
             wp.capture_if(self.stability.any_strong, self._solve_in_full)
+        if self._motor_law:
+            motor_solve.solve(
+                model, state, self.data, self.band, self.law.gain, self._motors, last, found, self._solution
+            )
         return self._solution
 
     @property
@@ -268,6 +278,8 @@ class ImplicitStepper:
         kept |= {f"balance_{name}": getattr(self.balance, name).numpy().copy() for name in balance.MEMORY}
         if self.stability is not None:
             kept |= {name: getattr(self.stability, name).numpy().copy() for name in _STABILITY_MEMORY}
+        if self._motor_law:
+            kept["held_torque"] = self._system.state.data.motor.held.numpy().copy()
         for name, x in self._increments_kept().items():
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
@@ -276,7 +288,9 @@ class ImplicitStepper:
         kept = self._increments_kept()
         for name, values in recalled(self.steps, memory).items():
             whose, _, part = name.partition("_")
-            if part in ("node", "body"):
+            if name == "held_torque":
+                self._system.state.data.motor.held.assign(values)
+            elif part in ("node", "body"):
                 getattr(kept[whose], part).assign(values)
             elif whose == "balance":
                 getattr(self.balance, part).assign(values)

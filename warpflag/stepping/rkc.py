@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.rod import comoving_chart, reconstruction
-from warpflag_kernels.stepping import dense_output, health, rkc, rkc_arrays
+from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
@@ -65,6 +65,8 @@ class RkcStepper:
         s = self._system
         rkc.begin_pass(s.model, s.state, s.chart, s.control, self.steps, self.data, self._euler)
         reconstruction.reconstruct(s.model, s.state, s.chart)
+        if s.model.timed:
+            evaluation_time.of_stage(s.state, s.control, s.chart, s.model.device)
         launch_right_hand_side(s.model, s.state)
         # Most passes are stages inside a step: what happens between steps is not even launched there.
         wp.capture_if(s.control.between_steps, self._launch_between_steps)

@@ -18,6 +18,8 @@ _KNOWN = (
     ("steric_force_density", "contact force", "f_c", "pN/µm"),
     ("body_speed", "swimming speed", "v", "µm/s"),
     ("motor_rate", "motor rate", "", "Hz"),
+    ("motor_torque", "motor torque", "", "pN µm"),
+    ("motor_drive", "motor drive", "", ""),
     ("body_rate", "body rate", "", "Hz"),
     ("elastic_energy", "elastic energy", "", "pN µm"),
 )

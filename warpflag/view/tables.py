@@ -25,6 +25,7 @@ _UNITS = {
     "body_speed": "um/s",
     "body_rate": "Hz",
     "motor_rate": "Hz",
+    "motor_torque": "pN um",
 }
 
 

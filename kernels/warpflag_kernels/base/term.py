@@ -41,6 +41,9 @@ class Term:
             energy(model, state, e, k, energy): adds what the term has stored at element e, its segment and the joint
                 after it, to `energy` [pN um], in float64. Its forces are then minus the gradient of that. The forces of
                 a term without it count as work from outside in the power balance of a step.
+            settle(model, state, c): called when all else that acts on the flagella of cell c and on its body is known,
+                and before the body moves: adds to `spin_torque` and `flagellum_torque` what depends on their rates.
+                One term alone can have it.
 
         contact: whether an implicit step solves for the term's forces instead of evaluating them.
         linearised: the term whose forces are this one's first variation; its launch is
@@ -50,6 +53,8 @@ class Term:
             `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
         balanced: whether the power balance of a step holds with it: not with random forces, nor where what it stores
             changes at a pose that stands still.
+        within_step: the term that stands for this one in an implicit step. None: itself.
+        timed: whether it depends on time itself, `State.time`.
     """
 
     name: str
@@ -59,6 +64,8 @@ class Term:
     linearised: "Term | None" = None
     stiffness: Callable[..., None] | None = None
     balanced: bool = True
+    within_step: "Term | None" = None
+    timed: bool = False
 
 
 def variant(terms: Sequence[Term]) -> str:
@@ -69,7 +76,7 @@ def variant(terms: Sequence[Term]) -> str:
 @functools.cache
 def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     """Device functions of several terms together, in their order: those of `Term.functions`, each one function that
-    adds up all terms; but `in_cell` and `in_flagellum`, which stay lists."""
+    adds up all terms; but `in_cell` and `in_flagellum`, which stay lists, and `settle`, of one term or None."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     module = p.module("terms", variant(terms))
@@ -127,4 +134,5 @@ def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
         energy=added(of("energy"), wp.float64),
         in_cell=of("in_cell"),
         in_flagellum=of("in_flagellum"),
+        settle=next(iter(of("settle")), None),
     )

@@ -18,6 +18,8 @@ import warp as wp
 from warpflag_kernels.base.plan import Plan, Switches
 from warpflag_kernels.base.precision import Precision
 
+NEVER = -1.0e30  # a time before any other [s]
+
 
 @functools.cache
 def structs(p: Precision) -> SimpleNamespace:
@@ -45,6 +47,24 @@ def structs(p: Precision) -> SimpleNamespace:
         torque: wp.array(dtype=real)  # T_m [pN um]
         axis: wp.array(dtype=vec3)  # m
         anchor: wp.array(dtype=vec3)  # r_0 [um]
+        # Where the torque is not constant, see motor/laws.py.
+        curve: wp.array(dtype=vec3)  # [2 K], forward and reverse: plateau [pN um], knee [rad/s], slope [pN um s]
+        prescribed: wp.array(dtype=wp.int32)  # 1: the rate is prescribed, not the torque
+        rate: wp.array(dtype=real)  # that rate, relative to the body [rad/s]
+        first_switch: wp.array(dtype=wp.int32)  # [K + 1], flagellum k has the corners from first_switch[k] on
+        switch_time: wp.array(dtype=wp.float64)  # [corners] [s]
+        switch_drive: wp.array(dtype=real)  # [corners], drive there, from 1 (forward) to -1 (reverse)
+
+    @wp.struct
+    class Polymorphs:
+        """Forms of a flagellum, see rod/polymorphs.py; per flagellum [K] unless said otherwise."""
+
+        rest_strain: wp.array(dtype=vec3)  # [4 K], h Omega^0 of the four forms [rad]
+        ramp: wp.array(dtype=wp.float64)  # in which the ground state changes [s]
+        target: wp.array(dtype=wp.int32)  # form that a reversed motor leads to
+        # Moments [pN um]: at root and tip, and beside a joint of the other form; toward the target, and back.
+        nucleation: wp.array(dtype=wp.vec2d)
+        propagation: wp.array(dtype=wp.vec2d)
 
     @wp.struct
     class Hook:
@@ -103,6 +123,7 @@ def structs(p: Precision) -> SimpleNamespace:
         rod: Rod
         motor: Motor
         hook: Hook
+        polymorphs: Polymorphs
         drag: Drag
         pairs: Pairs
         steric: Steric
@@ -120,8 +141,28 @@ def structs(p: Precision) -> SimpleNamespace:
         body_axis: wp.array(dtype=vec3)  # [C], e_b3, points to the rear
 
     @wp.struct
+    class MotorState:
+        """Per flagellum [K]; only where the torque is not constant."""
+
+        torque: wp.array(dtype=real)  # at the moment evaluated [pN um]
+        held: wp.array(dtype=real)  # in an implicit step [pN um]
+        slope: wp.array(dtype=real)  # of the piece of its curve that it was on last [pN um s]
+
+    @wp.struct
+    class Forms:
+        """Form of every joint [E], and its ground state now; only with polymorphs."""
+
+        form: wp.array(dtype=wp.int32)
+        before: wp.array(dtype=wp.int32)  # the form that it had until `changed`
+        changed: wp.array(dtype=wp.float64)  # when [s]
+        rest_strain: wp.array(dtype=vec3)  # h Omega^0 at the time of the evaluation [rad]
+
+    @wp.struct
     class State:
         pose: Pose
+        time: wp.array(dtype=wp.float64)  # [C], of the evaluation [s]; only where something depends on it
+        motor: MotorState
+        forms: Forms
         active: wp.array(dtype=wp.int32)  # [C], 1: the cell takes part in this pass
         # Joint i couples segments i and i + 1: energy gradients with respect to the two segment vectors and spins.
         joint_before: wp.array(dtype=vec3)  # [E] [pN]; of the hook with respect to the unit vector m [pN um]
@@ -180,6 +221,11 @@ class DeviceModel:
         """Whether anything can be in contact."""
         return any(term.contact for term in self.terms)
 
+    @property
+    def timed(self) -> bool:
+        """Whether any force depends on time itself."""
+        return any(term.timed for term in self.terms)
+
 
 @dataclass(frozen=True)
 class DeviceState:
@@ -226,4 +272,13 @@ def allocate_state(model: DeviceModel) -> Any:
     s.force, s.velocity, s.spin_torque = zeros(elements, p.vec3), zeros(elements, p.vec3), zeros(elements, p.real)
     s.flagellum_force, s.flagellum_torque = zeros(flagella, p.vec3), zeros(flagella, p.vec3)
     s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
+    if model.timed:
+        s.time = zeros(cells, wp.float64)
+    if model.switches.has("motor law"):
+        for name in ("torque", "held", "slope"):
+            setattr(s.motor, name, zeros(flagella, p.real))
+    if model.switches.has("polymorphs"):
+        s.forms.form, s.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
+        s.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
+        s.forms.rest_strain = zeros(elements, p.vec3)
     return s

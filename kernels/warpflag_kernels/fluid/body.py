@@ -71,6 +71,22 @@ def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     f = functions(p, terms)
     sum_flagellum, move = f.sum_flagellum, f.move
     module = p.module("body", variant(terms))
+    settle = combined(p, terms).settle
+    kernels = SimpleNamespace()
+    if settle is not None:
+
+        @wp.kernel(module=module)
+        def settle_all(
+            # Model:
+            model: Model,
+            # Out:
+            state: State,
+        ):
+            c = wp.tid()
+            if state.active[c] != 0:
+                settle(model, state, c)
+
+        kernels.settle = settle_all
 
     @wp.kernel(module=module)
     def sum_flagella(
@@ -94,7 +110,8 @@ def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
         if state.active[c] != 0:
             move(model, state, c)
 
-    return SimpleNamespace(sum_flagella=sum_flagella, move=move_all)
+    kernels.sum_flagella, kernels.move = sum_flagella, move_all
+    return kernels
 
 
 def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
@@ -109,7 +126,16 @@ def move_bodies(model: DeviceModel, state: DeviceState) -> None:
     wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
-def body_motion(model: DeviceModel, state: DeviceState) -> None:
-    """Velocity [um/s] and angular velocity [rad/s] of every body, into `body_velocity` and `body_spin`."""
-    sum_flagella(model, state, model.terms)
+def body_motion(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...] | None = None) -> None:
+    """Velocity [um/s] and angular velocity [rad/s] of every body, into `body_velocity` and `body_spin`.
+
+    Args:
+        model, state: of the batch.
+        terms: those that count; default: all of the model.
+    """
+    terms = model.terms if terms is None else terms
+    sum_flagella(model, state, terms)
+    if any(hasattr(term.functions(model.precision), "settle") for term in terms):
+        kernel = _kernels(model.precision, terms).settle
+        wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
     move_bodies(model, state)

@@ -21,17 +21,59 @@ from warpflag_kernels.rod import chain_chart, hessian
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device function `body_rate`: the body's mobility on six numbers."""
-    vec3, vec6 = p.vec3, block_band.types(p).vec6
+    """Device functions: the body's mobility on six numbers, and the inverse of a matrix."""
+    real, vec3, vec6, mat66 = p.real, p.vec3, block_band.types(p).vec6, block_band.types(p).mat66
     Model, State, respond = structs(p).Model, structs(p).State, body.mobility(p).respond
+    module = p.module("body_coupling_functions")
 
-    @wp.func(module=p.module("body_coupling_functions"))
+    @wp.func(module=module)
     def body_rate(model: Model, state: State, c: wp.int32, load: vec6):
         """Velocity and angular velocity of a body under force and torque."""
         u, w = respond(model, state, c, vec3(load[0], load[1], load[2]), vec3(load[3], load[4], load[5]))
         return vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
-    return SimpleNamespace(body_rate=body_rate)
+    @wp.func(module=module)
+    def inverse6(a: mat66):
+        """Inverse by Gauss-Jordan with row pivoting."""
+        m = a
+        inv = wp.identity(6, dtype=real)
+        col = int(0)
+        while col < 6:
+            best = int(col)
+            r = int(col) + 1
+            while r < 6:
+                if wp.abs(m[r, col]) > wp.abs(m[best, col]):
+                    best = r
+                r += 1
+            j = int(0)
+            while j < 6:
+                swap = m[col, j]
+                m[col, j] = m[best, j]
+                m[best, j] = swap
+                swap = inv[col, j]
+                inv[col, j] = inv[best, j]
+                inv[best, j] = swap
+                j += 1
+            scale = real(1.0) / m[col, col]
+            j = int(0)
+            while j < 6:
+                m[col, j] = m[col, j] * scale
+                inv[col, j] = inv[col, j] * scale
+                j += 1
+            r = int(0)
+            while r < 6:
+                if r != col:
+                    f = m[r, col]
+                    j = int(0)
+                    while j < 6:
+                        m[r, j] = m[r, j] - f * m[col, j]
+                        inv[r, j] = inv[r, j] - f * inv[col, j]
+                        j += 1
+                r += 1
+            col += 1
+        return inv
+
+    return SimpleNamespace(body_rate=body_rate, inverse6=inverse6)
 
 
 @functools.cache
@@ -39,7 +81,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
     real, vec3, t = p.real, p.vec3, block_band.types(p)
     mat46, mat66, vec6, Band = t.mat46, t.mat66, t.vec6, t.Band
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
-    Increment, body_rate = chain_chart.types(p).Increment, functions(p).body_rate
+    Increment, body_rate, inverse6 = chain_chart.types(p).Increment, functions(p).body_rate, functions(p).inverse6
     solve_column, solve_columns = cholesky.functions(p).solve_column, block_band_simd.functions(p).columns
     follow = block_band.functions(p).follow
     module = p.module("body_coupling", "bearing" if bearing_torque else "")
@@ -167,47 +209,6 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
             for column in range(6):
                 take_share(model, band, k, column)
             k += 1
-
-    @wp.func(module=module)
-    def inverse6(a: mat66):
-        """Inverse by Gauss-Jordan with row pivoting."""
-        m = a
-        inv = wp.identity(6, dtype=real)
-        col = int(0)
-        while col < 6:
-            best = int(col)
-            r = int(col) + 1
-            while r < 6:
-                if wp.abs(m[r, col]) > wp.abs(m[best, col]):
-                    best = r
-                r += 1
-            j = int(0)
-            while j < 6:
-                swap = m[col, j]
-                m[col, j] = m[best, j]
-                m[best, j] = swap
-                swap = inv[col, j]
-                inv[col, j] = inv[best, j]
-                inv[best, j] = swap
-                j += 1
-            scale = real(1.0) / m[col, col]
-            j = int(0)
-            while j < 6:
-                m[col, j] = m[col, j] * scale
-                inv[col, j] = inv[col, j] * scale
-                j += 1
-            r = int(0)
-            while r < 6:
-                if r != col:
-                    f = m[r, col]
-                    j = int(0)
-                    while j < 6:
-                        m[r, j] = m[r, j] - f * m[col, j]
-                        inv[r, j] = inv[r, j] - f * inv[col, j]
-                        j += 1
-                r += 1
-            col += 1
-        return inv
 
     @wp.kernel(module=module)
     def factorise_bodies(

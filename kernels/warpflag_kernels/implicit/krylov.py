@@ -19,7 +19,7 @@ import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.implicit import linear_system, linearised
+from warpflag_kernels.implicit import linearised
 from warpflag_kernels.implicit import stability as stability_stage
 from warpflag_kernels.rod import chain_chart
 
@@ -298,7 +298,7 @@ def solve(
     wp.launch(kernels.begin, cells, inputs=[model.data, state.data, x, space.data], device=device)
     for j in range(DIMENSION):
         linearised.apply(model, state, stiffness, band, gain, space.basis[j], work)
-        linear_system.solve(model, state, band, work)
+        linearised.solve(model, state, band, work)
         wp.launch(kernels.orthogonalise, cells, inputs=[model.data, state.data, j, work, space.data], device=device)
     wp.launch(kernels.combine, cells, inputs=[model.data, state.data, space.data, x], device=device)
     wp.launch(kernels.unmask, cells, inputs=[stability, state.data], device=device)

@@ -1,7 +1,8 @@
-"""The linearised equations of a step in full, with the pair sum that the matrix leaves out: D^-1 (1/dt + g M H) x.
+"""The linearised equations of a step: the matrix with the local mobility, bodies and flagella together, factorised and
+solved with; and in full, with the pair sum that the matrix leaves out, the product D^-1 (1/dt + g M H) x.
 
-The forces are the first variation of those terms that have one. The stability of a step is measured with it, see
-`stability`.
+The forces of the product are the first variation of those terms that have one. The stability of a step is measured with
+it, see `stability`.
 """
 
 import functools
@@ -13,7 +14,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body, node_velocity
-from warpflag_kernels.implicit import block_band
+from warpflag_kernels.implicit import block_band, body_coupling
 from warpflag_kernels.rod import chain_chart, forces
 
 
@@ -97,3 +98,30 @@ def apply(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any, gai
     node_velocity.node_velocities(model, state)
     inputs = [model.data, state.data, band, gain, x, out]
     wp.launch(_kernel(model.precision), model.element_count, inputs=inputs, device=model.device)
+
+
+def set_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
+    """Second derivatives of the energies at the state's pose, of all terms that have them, into `stiffness`."""
+    for term in model.terms:
+        if term.stiffness is not None:
+            term.stiffness(model, state, stiffness)
+
+
+def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any) -> None:
+    """Assembles and factorises the system of every cell; `singular` tells of a pivot that is not positive.
+
+    Args:
+        model, state: of the batch.
+        stiffness: second derivatives at the state's pose, struct `Stiffness`.
+        band: struct `Band`, with step and weight of every cell.
+    """
+    block_band.assemble(model, state, stiffness, band)
+    body_coupling.couple(model, state, stiffness, band)
+    block_band.factorise(model, state, band)
+    body_coupling.factorise(model, state, band)
+
+
+def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
+    """From D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place of them."""
+    block_band.solve(model, state, band, x)
+    body_coupling.solve(model, state, band, x)

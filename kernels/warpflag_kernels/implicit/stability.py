@@ -21,7 +21,7 @@ import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.implicit import linear_system, linearised
+from warpflag_kernels.implicit import linearised
 from warpflag_kernels.rod import chain_chart
 
 LEAST = 1.3  # least over-implicitness, enough for kappa up to 2.6
@@ -283,7 +283,7 @@ def measure(
     kernels, device = _kernels(model.precision), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
-    linear_system.solve(model, state, band, response)
+    linearised.solve(model, state, band, response)
     inputs = [model.data, response, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, response, band.step, longest_step, stability, over_implicit, state.data]

@@ -99,6 +99,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             flagella = model.first_node.shape[0] - 1
             turned = motor_turn(model, dense.start, state.pose, e, k, c)
             dense.motor_angle[slot * flagella + k] = dense.start_motor_angle[k] + turned
+            if dense.motor_torque.shape[0] > 0:
+                dense.motor_torque[slot * flagella + k] = state.motor.torque[k]
             if k == model.first_flagellum[c]:
                 i = slot * (model.first_flagellum.shape[0] - 1) + c
                 dense.step[i] = dense.steps[c]

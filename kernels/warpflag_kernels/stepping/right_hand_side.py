@@ -69,7 +69,8 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: s
     PairSum, Neighbours = rotne_prager.struct(pair), neighbours.struct(p)
     evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
     gather, motion = forces.functions(p, terms).gather, body.functions(p, terms)
-    sum_flagellum, move = motion.sum_flagellum, motion.move
+    sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
+    settles = settle is not None
     move_cell = node_velocity.functions(p, pair, pairs, form).move_cell
     name = "_".join([variant(terms), pairs, form, *["short"] * (pair != p)])
 
@@ -95,6 +96,8 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: s
                 e += 1
             sum_flagellum(model, state, k)
             k += 1
+        if wp.static(settles):
+            settle(model, state, c)
         move(model, state, c)
         move_cell(model, state, s, c)
 

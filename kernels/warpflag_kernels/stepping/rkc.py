@@ -22,6 +22,7 @@ from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, STEP_TOLERANCE, Control
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.motor import laws as motor_laws
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
 from warpflag_kernels.stepping import accuracy, step_control
@@ -47,7 +48,7 @@ MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unsta
 
 
 @functools.cache
-def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
+def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
@@ -56,7 +57,7 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     add_estimate = accuracy.functions(independent=False).add
     advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
     chebyshev, weight = polynomials.chebyshev, polynomials.weight
-    module = p.module("euler" if euler else "rkc")
+    module = p.module("euler" if euler else "rkc", "motor_law" if motor_law else "")
     damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, RADIUS_MARGIN, PROBE_SIZE[p.name]))
     weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
     rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
@@ -66,6 +67,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
     no_fault, inaccurate, unstable = (
         wp.constant(wp.int32(x)) for x in (NO_FAULT, encode(Fault.ACCURACY), encode(Fault.UNSTABLE))
     )
+
+    twist_bound = motor_laws.curves(p).twist_bound
 
     @wp.func(module=module)
     def outgrown(control: Control, rkc: Rkc, c: wp.int32):
@@ -108,7 +111,10 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             if wp.static(euler):
                 rkc.stages[c] = 1
             else:
-                stiffness = safety * rkc.spectral_radius[c] * control.step[c]
+                radius = rkc.spectral_radius[c]
+                if wp.static(motor_law):  # on its plateau a motor lets the tripod go at once
+                    radius = wp.max(radius, twist_bound(model, c))
+                stiffness = safety * radius * control.step[c]
                 wanted = wp.min(wp.sqrt(one + stage_factor * stiffness), most_stages)
                 rkc.stages[c] = 1 + wp.max(wp.int32(wanted), 1)
         s = rkc.stages[c]
@@ -187,12 +193,8 @@ def _kernels(p: Precision, euler: bool) -> SimpleNamespace:
             chart.increment[e] = first
             return
         previous = rkc.previous[e]
-        y = (
-            real(a[0]) * previous
-            + real(a[1]) * rkc.before_previous[e]
-            + real(a[2]) * chart.rate[e]
-            + real(a[3]) * rkc.start_rate[e]
-        )
+        y = real(a[0]) * previous + real(a[1]) * rkc.before_previous[e] + real(a[2]) * chart.rate[e]
+        y += real(a[3]) * rkc.start_rate[e]
         rkc.before_previous[e] = previous
         rkc.previous[e] = y
         chart.increment[e] = y
@@ -350,7 +352,7 @@ def begin_pass(
     model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any, euler: bool
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
-    kernels = _kernels(model.precision, euler)
+    kernels = _kernels(model.precision, euler, not euler and model.switches.has("motor law"))
     inputs = [model.data, steps, state.data, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, chart]
@@ -359,7 +361,7 @@ def begin_pass(
 
 def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
     """Estimates the error of every completed step and clears `commit` where the step is rejected."""
-    kernels = _kernels(model.precision, False)
+    kernels = _kernels(model.precision, False, model.switches.has("motor law"))
     inputs = [model.data, state.data, control, chart, rkc]
     wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, control, steps, chart]
@@ -368,7 +370,7 @@ def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
     """Stores what later stages need and advances the stage counter of every cell."""
-    kernels = _kernels(model.precision, euler)
+    kernels = _kernels(model.precision, euler, not euler and model.switches.has("motor law"))
     inputs = [model.data, state.data, chart, rkc]
     wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
     inputs = [model.data, chart, state.data, control, rkc]

@@ -3,12 +3,16 @@
 from warpflag_kernels.base.term import Term
 from warpflag_kernels.contact.pair_forces import BODY_CONTACT, STERIC, STERIC_WITH_SELF
 from warpflag_kernels.motor.hook import HOOK
+from warpflag_kernels.motor.laws import MOTOR_LAW
 from warpflag_kernels.motor.torque import MOTOR
 from warpflag_kernels.rod.elastic import BEARING, ELASTIC
 from warpflag_kernels.rod.external import EXTERNAL
 from warpflag_kernels.rod.free_end import FREE_END
 
-TERMS = (MOTOR, ELASTIC, BEARING, HOOK, STERIC, STERIC_WITH_SELF, BODY_CONTACT, EXTERNAL, FREE_END)
+TERMS = (
+    *(MOTOR, MOTOR_LAW, ELASTIC, BEARING, HOOK, STERIC, STERIC_WITH_SELF),
+    *(BODY_CONTACT, EXTERNAL, FREE_END),
+)
 
 
 def terms_named(names: tuple[str, ...]) -> tuple[Term, ...]:

@@ -1,0 +1,227 @@
+"""Motors in an implicit step: the torques that obey the law of each motor at the rate that the step gives it.
+
+The law is not linearised across a step, because it has kinks: a motor whose slope is taken from one side of the knee
+leaps to the other side within a step, where the hook is stiff, and back in the next. Torques are found in their own
+space, as contact forces are. Both iterations of a step evaluate the velocities with the torques known so far and solve
+with the same matrix, in which torques are constant. With what torques then do to the step,
+
+    Omega_k = Omega_k^0 + sum_j G_kj (T_j - T_j^0),     Omega: rate at the collocation point, (w delta + e/g)/dt,
+
+every T_k is on its curve, in which it is linear piece by piece. A unit torque on each tripod with the bodies at rest is
+one solution along all flagella at once, t; motors meet through the six unknowns of their body alone. Given its motion
+every motor settles by itself in closed form, and Newton's method finds the motion (`motor/laws.py` does the same at one
+moment, with the tripod's drag in place of the step's matrix).
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.fluid import body
+from warpflag_kernels.implicit import block_band, body_coupling, collocation
+from warpflag_kernels.motor import laws
+from warpflag_kernels.rod import chain_chart
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `MotorSolve`: what torques do to a step. Per flagellum [K] unless said otherwise."""
+    real, vec6, Increment = p.real, chain_chart.types(p).vec6, chain_chart.types(p).Increment
+
+    @wp.struct
+    class MotorSolve:
+        answer: Increment  # t: of all tripods to unit torques, the bodies at rest
+        on_body: wp.array(dtype=vec6)  # motion of the body that a unit torque causes
+        by_body: wp.array(dtype=vec6)  # turn of the tripod against the body, over the motion of the body
+        free_rate: wp.array(dtype=real)  # Omega^0 [rad/s]
+        change: wp.array(dtype=real)  # T - T^0 [pN um]
+        moved: wp.array(dtype=vec6)  # [C], motion of the body that all changes cause
+
+    return MotorSolve
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `MotorSolve`, zero; none where torques are constant."""
+    p, m = model.precision, struct(model.precision)()
+    if model.switches.has("motor law"):
+        vec6 = chain_chart.types(p).vec6
+        flagella, device = model.flagellum_count, model.device
+        m.answer = chain_chart.allocate(model)
+        m.on_body, m.by_body = (wp.zeros(flagella, dtype=vec6, device=device) for _ in range(2))
+        m.free_rate, m.change = (wp.zeros(flagella, dtype=p.real, device=device) for _ in range(2))
+        m.moved = wp.zeros(model.cell_count, dtype=vec6, device=device)
+    return m
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3, vec4 = p.real, p.vec3, p.vec4
+    Model, State, Implicit, MotorSolve = structs(p).Model, structs(p).State, collocation.struct(p), struct(p)
+    Band, vec6 = block_band.types(p).Band, block_band.types(p).vec6
+    Increment, law, respond = chain_chart.types(p).Increment, laws.curves(p), body.mobility(p).respond
+    drive_at, settled = law.drive_at, law.settled
+    body_rate, inverse6 = body_coupling.functions(p).body_rate, body_coupling.functions(p).inverse6
+    follow = block_band.functions(p).follow
+    most = wp.constant(laws.MOST_ITERATIONS)
+    module = p.module("motor_solve")
+
+    @wp.kernel(module=module)
+    def load_tripods(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        motors: MotorSolve,
+    ):
+        e = wp.tid()
+        if state.active[model.cell_of[e]] == 0:
+            return
+        load = vec4(real(0.0))
+        if e == model.first_node[model.flagellum_of[e]]:
+            load[3] = real(1.0)
+        motors.answer.node[e] = load
+
+    @wp.kernel(module=module)
+    def couple(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        band: Band,
+        # Out:
+        motors: MotorSolve,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0:
+            return
+        m = state.pose.tangent[first]
+        back = vec6(real(0.0))
+        for j in range(3):
+            back += wp.transpose(band.from_body[3 * k + j]) * motors.answer.node[first + j]
+        u, w = respond(model, state, c, vec3(real(0.0)), -m)
+        rate = vec6(u[0], u[1], u[2], w[0], w[1], w[2]) - real(band.weight[c]) * body_rate(model, state, c, back)
+        motors.on_body[k] = real(band.step[c]) * (band.body_inverse[c] * rate)
+        turn = vec6(real(0.0), real(0.0), real(0.0), m[0], m[1], m[2])
+        for column in range(6):
+            turn[column] = turn[column] + band.body_columns[6 * first + column][3]
+        motors.by_body[k] = -turn
+
+    @wp.kernel(module=module)
+    def find_torques(
+        # Model:
+        model: Model,
+        # State:
+        imp: Implicit,
+        band: Band,
+        gain: wp.array(dtype=wp.float64),
+        last: Increment,
+        found: Increment,
+        x: Increment,
+        # Out:
+        state: State,
+        motors: MotorSolve,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        g = real(gain[c])
+        per_step = real(wp.float64(1.0) / band.step[c])
+        ratio = real(imp.ratio[c])
+        begin = model.first_flagellum[c]
+        end = model.first_flagellum[c + 1]
+        before = ratio * last.body[c] + (found.body[c] + x.body[c]) / g
+        spin = vec3(before[3], before[4], before[5])
+        k = begin
+        while k < end:
+            first = model.first_node[k]
+            turned = ratio * last.node[first][3] + (found.node[first][3] + x.node[first][3]) / g
+            motors.free_rate[k] = per_step * (turned - wp.dot(state.pose.tangent[first], spin))
+            k += 1
+        moved = vec6(real(0.0))  # motion of the body that the changes of torque cause, over g
+        iteration = int(0)
+        while iteration <= most:
+            changed = bool(iteration == 0)
+            remaining = moved
+            jacobian = wp.identity(6, dtype=real)
+            k = begin
+            while k < end:
+                mobility = per_step * motors.answer.node[model.first_node[k]][3]
+                free = motors.free_rate[k] + per_step * wp.dot(motors.by_body[k], moved)
+                load = free - mobility * state.motor.held[k]
+                torque, softness, slope = settled(model, k, drive_at(model, k, state.time[c]), mobility, load)
+                if slope != state.motor.slope[k]:
+                    changed = True
+                state.motor.slope[k] = slope
+                motors.change[k] = torque - state.motor.held[k]
+                remaining -= motors.change[k] * motors.on_body[k]
+                jacobian += wp.outer(motors.on_body[k], (softness * per_step) * motors.by_body[k])
+                k += 1
+            if not changed or iteration == most:
+                iteration = most + 1
+            else:
+                moved -= inverse6(jacobian) * remaining
+                iteration += 1
+        motors.moved[c] = g * moved
+        k = begin
+        while k < end:
+            state.motor.held[k] = state.motor.held[k] + motors.change[k]
+            state.motor.torque[k] = state.motor.held[k]
+            k += 1
+
+    @wp.kernel(module=module)
+    def add_changes(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        band: Band,
+        gain: wp.array(dtype=wp.float64),
+        motors: MotorSolve,
+        # Out:
+        x: Increment,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        own = x.node[e] + (real(gain[c]) * motors.change[k]) * motors.answer.node[e]
+        x.node[e] = follow(band, e, own, motors.moved[c])
+        if e == model.first_node[model.first_flagellum[c]]:
+            x.body[c] = x.body[c] + motors.moved[c]
+
+    return SimpleNamespace(load_tripods=load_tripods, couple=couple, find_torques=find_torques, add_changes=add_changes)
+
+
+def prepare(model: DeviceModel, state: DeviceState, band: Any, motors: Any) -> None:
+    """What unit torques do to a step, from the factors of its matrix."""
+    kernels, device = _kernels(model.precision), model.device
+    inputs = [model.data, state.data, motors]
+    wp.launch(kernels.load_tripods, model.element_count, inputs=inputs, device=device)
+    block_band.solve(model, state, band, motors.answer)
+    wp.launch(kernels.couple, model.flagellum_count, inputs=[model.data, state.data, band, motors], device=device)
+
+
+def solve(
+    model: DeviceModel, state: DeviceState, data: Any, band: Any, gain: Any, motors: Any, last: Any, found: Any, x: Any
+) -> None:
+    """Puts every motor on its law: the torques in `State.motor.held`, and what their changes do to an increment.
+
+    Args:
+        model, state: of the batch, with the pose that x is an increment of, at the time of the collocation point.
+        data, band, gain, motors: structs `Implicit` and `Band`, g, and what `prepare` has found.
+        last, found: the last increment, and what has been found of this one, both at the present pose.
+        x: what an iteration has found with the torques as they were; changed.
+    """
+    kernels, device = _kernels(model.precision), model.device
+    inputs = [model.data, data, band, gain, last, found, x, state.data, motors]
+    wp.launch(kernels.find_torques, model.cell_count, inputs=inputs, device=device)
+    inputs = [model.data, state.data, band, gain, motors, x]
+    wp.launch(kernels.add_changes, model.element_count, inputs=inputs, device=device)

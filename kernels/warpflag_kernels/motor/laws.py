@@ -1,0 +1,199 @@
+"""Motors whose torque depends on their rate or on time, or whose rate is prescribed.
+
+The rate Omega of a motor is that of its tripod about the motor axis m relative to the body. With the sense of rotation
+that its drive asks for counted positive, its torque is
+
+    T = |drive| T_0                        for Omega below the knee,
+    T = |drive| (T_0 - slope (Omega - knee)) above it, and nothing beyond the rate without load.
+
+The drive is 1 forward and -1 in reverse, and goes from one to the other along a ramp; each sense has its own curve.
+
+The torque sets the rate at once: Omega = mu (T + Q) - m . w, with the tripod's mobility mu, the torque Q of the hook,
+and the angular velocity of the body w, on which all motors react,
+
+    w = w_0 - R sum_k T_k m_k,     w_0: without the motors, R: the body's rotational mobility.
+
+The slope is a thousand times the drag of the tripod, so torques are found in closed form: given w, every motor by
+itself from a curve of straight pieces; w from the three linear equations that remain, repeated while some motor changes
+its piece. That is Newton's method on a monotone map of straight pieces, and it ends in the exact solution.
+
+Within an implicit step the torque is a number, `State.motor.held`, which `implicit/motor_solve.py` finds.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.term import Term
+from warpflag_kernels.base.types import structs
+from warpflag_kernels.fluid import body
+
+# Newton steps for the body's angular velocity. Tripods are so light that a motor's torque hardly feels the body: two
+# steps settle it, a third where a motor changes its piece.
+MOST_ITERATIONS = 8
+
+
+@functools.cache
+def curves(p: Precision) -> SimpleNamespace:
+    """Device functions of the law of one motor: its drive at a time, its curve, and what it settles to."""
+    real, vec3 = p.real, p.vec3
+    Model = structs(p).Model
+    module = p.module("motor_curves")
+    zero = wp.constant(real(0.0))
+    one = wp.constant(real(1.0))
+
+    @wp.func(module=module)
+    def drive_at(model: Model, k: wp.int32, time: wp.float64):
+        """Drive of motor k at a time: linear between the corners of its table, constant outside."""
+        low = model.motor.first_switch[k]
+        high = model.motor.first_switch[k + 1] - 1
+        if time <= model.motor.switch_time[low]:
+            return model.motor.switch_drive[low]
+        if time >= model.motor.switch_time[high]:
+            return model.motor.switch_drive[high]
+        while high - low > 1:
+            middle = (low + high) / 2
+            if model.motor.switch_time[middle] <= time:
+                low = middle
+            else:
+                high = middle
+        span = model.motor.switch_time[high] - model.motor.switch_time[low]
+        share = real((time - model.motor.switch_time[low]) / span)
+        return model.motor.switch_drive[low] + share * (model.motor.switch_drive[high] - model.motor.switch_drive[low])
+
+    @wp.func(module=module)
+    def sense(model: Model, k: wp.int32, drive: real):
+        """Sense in which the drive turns motor k, 1 or -1, and its curve there, scaled by the drive."""
+        curve = model.motor.curve[2 * k]
+        turns = one
+        if drive < zero:
+            curve = model.motor.curve[2 * k + 1]
+            turns = -one
+        strength = wp.abs(drive)
+        if curve[0] < zero:
+            turns = -turns
+        return turns, vec3(strength * wp.abs(curve[0]), curve[1], strength * curve[2])
+
+    @wp.func(module=module)
+    def settled(model: Model, k: wp.int32, drive: real, mobility: real, load: real):
+        """Torque of motor k where Omega - mobility T(Omega) = load [rad/s]; how much it falls with the load; and the
+        slope of the piece of the curve that it is on, -1 for a prescribed rate."""
+        if model.motor.prescribed[k] != 0:
+            return (drive * model.motor.rate[k] - load) / mobility, one / mobility, -one
+        turns, curve = sense(model, k, drive)
+        own = turns * load
+        knee = curve[1]
+        if own <= knee - mobility * curve[0]:
+            return turns * curve[0], zero, zero
+        slope = curve[2]
+        if slope > zero and own < knee + curve[0] / slope:
+            softened = one / (one + slope * mobility)
+            return turns * (softened * (curve[0] - slope * (own - knee))), softened * slope, slope
+        return zero, zero, zero
+
+    @wp.func(module=module)
+    def twist_bound(model: Model, c: wp.int32):
+        """Bound of the rates of twist of cell c by Gershgorin's theorem, whatever holds its tripods back [1/s]."""
+        bound = wp.float64(0.0)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            rigidity = model.rod.hook_rigidity[k] + model.rod.twist_rigidity[k]
+            rate = real(2.0) * model.drag.spin_mobility[k] * rigidity / model.rod.segment_length[k]
+            bound = wp.max(bound, wp.float64(rate))
+            k += 1
+        return bound
+
+    return SimpleNamespace(drive_at=drive_at, settled=settled, twist_bound=twist_bound)
+
+
+@functools.cache
+def _functions(p: Precision) -> SimpleNamespace:
+    """Device function `settle`: the torques of all motors of a cell at one moment."""
+    real, vec3, mat33 = p.real, p.vec3, p.mat33
+    Model, State = structs(p).Model, structs(p).State
+    law, respond = curves(p), body.mobility(p).respond
+    drive_at, settled = law.drive_at, law.settled
+    most = wp.constant(MOST_ITERATIONS)
+    zero = wp.constant(real(0.0))
+
+    @wp.func(module=p.module("motor_law_functions"))
+    def settle(model: Model, state: State, c: wp.int32):
+        begin = model.first_flagellum[c]
+        end = model.first_flagellum[c + 1]
+        total = vec3(zero)
+        k = begin
+        while k < end:
+            total += state.flagellum_torque[k]
+            k += 1
+        no_force = vec3(zero)
+        _v, free = respond(model, state, c, no_force, total)
+        spin = free
+        iteration = int(0)
+        while iteration <= most:
+            changed = bool(iteration == 0)
+            reaction = vec3(zero)
+            stiffness = mat33(zero)
+            k = begin
+            while k < end:
+                first = model.first_node[k]
+                m = state.pose.tangent[first]
+                mobility = model.drag.spin_mobility[k]
+                load = mobility * state.spin_torque[first] - wp.dot(m, spin)
+                torque, softness, slope = settled(model, k, drive_at(model, k, state.time[c]), mobility, load)
+                if slope != state.motor.slope[k]:
+                    changed = True
+                state.motor.slope[k] = slope
+                state.motor.torque[k] = torque
+                reaction += torque * m
+                stiffness += softness * wp.outer(m, m)
+                k += 1
+            if not changed or iteration == most:
+                iteration = most + 1
+            else:
+                _v, slowed = respond(model, state, c, no_force, reaction)
+                jacobian = wp.identity(3, dtype=real)
+                for column in range(3):
+                    axis = vec3(stiffness[0, column], stiffness[1, column], stiffness[2, column])
+                    _v, answer = respond(model, state, c, no_force, axis)
+                    for row in range(3):
+                        jacobian[row, column] = jacobian[row, column] + answer[row]
+                spin = spin - wp.inverse(jacobian) * (spin - free + slowed)
+                iteration += 1
+        k = begin
+        while k < end:
+            first = model.first_node[k]
+            torque = state.motor.torque[k]
+            state.spin_torque[first] = state.spin_torque[first] + torque
+            state.flagellum_torque[k] = state.flagellum_torque[k] - torque * state.pose.tangent[first]
+            k += 1
+
+    return SimpleNamespace(settle=settle)
+
+
+@functools.cache
+def _held_functions(p: Precision) -> SimpleNamespace:
+    """Device functions of the torques that a step holds at present."""
+    real, vec3, Model, State = p.real, p.vec3, structs(p).Model, structs(p).State
+    module = p.module("held_motor_functions")
+
+    @wp.func(module=module)
+    def on_spin(model: Model, state: State, e: wp.int32, k: wp.int32, torque: real):
+        if e == model.first_node[k]:
+            return torque + state.motor.held[k]
+        return torque
+
+    @wp.func(module=module)
+    def on_body(model: Model, state: State, k: wp.int32, force: vec3, torque: vec3):
+        return force, torque - state.motor.held[k] * state.pose.tangent[model.first_node[k]]
+
+    return SimpleNamespace(on_spin=on_spin, on_body=on_body)
+
+
+MOTOR_LAW = Term(
+    "motor law",
+    functions=_functions,
+    within_step=Term("held motor", functions=_held_functions, timed=True),
+    timed=True,
+)
