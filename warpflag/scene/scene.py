@@ -188,6 +188,9 @@ class Scene(Section, key=""):
             if self.fluid.noise_tolerance is not None:
                 raise SceneError("fluid.noise_tolerance", self.fluid.noise_tolerance, f"needs {key} above 0", related)
             return
+        if self.motor.switching != "none" or any(spec.law != "constant" for spec in self.resolved_flagella()):
+            problem = "must be 0 with motors that switch or whose law is not constant"
+            raise SceneError(key, temperature, problem, ["motor.law", "motor.switching"])
         mode, numerics = self.hydrodynamics.mode, self.numerics
         if mode in ("between", "as_printed"):
             problem = (

@@ -16,7 +16,6 @@ from warpflag_kernels.implicit import (
     contact_solve,
     delassus,
     krylov,
-    linear_system,
     linearised,
     quasi_newton,
     stability,
@@ -127,7 +126,7 @@ class ThermalStepper:
         else:
             self._evaluate()
             strain_gradients.stiffness_without_prestress(model, state, self.stiffness)
-            linear_system.factorise(model, state, self.stiffness, parts.band)
+            linearised.factorise(model, state, self.stiffness, parts.band)
         equilibrium.right_hand_side(model, state, parts, self.noise, self._x, explicit)
         x = self._x if explicit else self._solve()
         additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
@@ -171,7 +170,7 @@ class ThermalStepper:
     def _solve(self) -> Any:
         """The increment of the step, from the right side."""
         model, state, parts = self._system.model, self._system.state, self._parts
-        linear_system.solve(model, state, parts.band, self._x)
+        linearised.solve(model, state, parts.band, self._x)
         found = self._x
         if self._touching:
             found = self._solved
