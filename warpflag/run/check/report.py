@@ -1,23 +1,23 @@
-"""What a scene requires, before it is run: its stages, memory, step, and the time it takes on this machine."""
+"""The report of `warpflag check`: the resolved scene, what it requires, and what it leaves out."""
 
 from __future__ import annotations
 
-from time import perf_counter
 from typing import Any
 
 import warp as wp
 from warpflag_kernels.stepping.right_hand_side import stages
 
+from warpflag.run.check.left_out import left_out
+from warpflag.run.check.rigid import turning
+from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, dumps
 
 __all__ = ["report"]
 
-_SAMPLE_SECONDS = 0.3
-
 
 def report(scene: Scene, device: str | None = None) -> str:
-    """The resolved scene as TOML, and below it as comments what it requires.
+    """The resolved scene as TOML, and below it as comments what it requires and what it leaves out.
 
     Args:
         scene: to look at.
@@ -36,7 +36,7 @@ def report(scene: Scene, device: str | None = None) -> str:
     names = ", ".join(name for name, _launch in stages(model))
     longest = float(simulation.system.control.longest_step.numpy()[0])
     values_per_frame = 6 * nodes + 2 * len(flagella) + 14
-    cost = _computing_time(simulation, longest)
+    time = needed(simulation)
     lines = [
         f"{len(flagella)} flagella, {segments} segments, {nodes} nodes",
         f"stages of a right-hand side: {names}",
@@ -45,25 +45,29 @@ def report(scene: Scene, device: str | None = None) -> str:
         f"memory {_mebibytes(_device_bytes(simulation))} on the device, "
         f"record {_mebibytes(8 * values_per_frame * (scene.frames + 1))}",
         f"stepper {scene.numerics.stepper}, step at most {longest:.3g} s",
-        f"time {cost:.3g} ms per simulated ms, {cost * scene.duration:.3g} s in all, from the first steps on this "
-        "machine; contacts add to it",
+        *_times(time, scene),
         *simulation.notes[0],
     ]
-    return dumps(scene) + "\n# What it requires\n" + "".join(f"# {line}\n" for line in lines)
+    without = left_out(scene, turning(scene))
+    return (
+        dumps(scene)
+        + "\n# What it requires\n"
+        + "".join(f"# {line}\n" for line in lines)
+        + "\n# What it leaves out, and how large that would be (docs/tradeoff.md)\n"
+        + "".join(f"# {line}\n" for line in without)
+    )
 
 
-def _computing_time(simulation: Simulation, step: float) -> float:
-    """Seconds of computing per simulated second, from runs that double until one is long enough to time."""
-    simulation.prepare()
-    reached, end = 0.0, simulation.scenes[0].duration
-    while True:
-        until = min(max(2 * reached, 4 * step), end)
-        began = perf_counter()
-        simulation.advance(until)
-        taken = perf_counter() - began
-        if taken > _SAMPLE_SECONDS or until >= end:
-            return taken / (until - reached)
-        reached = until
+def _times(time: Needed, scene: Scene) -> list[str]:
+    per_ms = time.stepping / (1e3 * scene.duration)
+    lines = [
+        f"time {time.least:.2g} to {time.most:.2g} s of computing: start {time.startup:.1f} s, stepping "
+        f"{time.stepping:.2g} s ({1e3 * per_ms:.3g} ms per simulated ms; up to {time.crowd:.2g} times that where "
+        f"flagella touch), frames, record and movie {time.output:.2g} s"
+    ]
+    if time.compiling:
+        lines.append(f"kernels were compiled just now, in {time.compiling:.0f} s, and are in the cache")
+    return lines
 
 
 def _device_bytes(simulation: Simulation) -> int:

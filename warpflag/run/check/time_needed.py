@@ -1,0 +1,108 @@
+"""The time that `warpflag run` will take for a scene: start-up, stepping, frames, record and movie, as a range."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpflag.observables.cells import bundle_lengths, phase_differences
+from warpflag.run.simulation import Simulation
+
+__all__ = ["Needed", "needed"]
+
+_SAMPLE_SECONDS = 0.3  # of computing
+_MOST_SECONDS = 8.0  # of computing for all samples
+_SETTLED = 4e-4  # s, when the steps of the start, which are short, are behind
+_FRAMES_OBSERVED = 8
+_COLD = 6.0  # s of preparing, above which kernels have been compiled
+_PER_FRAME = 1.5e-4  # s for the record of a frame
+_MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame
+# Contacts ask for more and dearer steps: stepping of whole runs over what the first steps say (docs/tradeoff.md).
+_LEAST, _FEW, _TOUCHING, _PER_FLAGELLUM, _CROWD = 0.8, 1.4, 1.8, 0.45, 8
+
+
+@dataclass(frozen=True)
+class Needed:
+    """What a run takes, in seconds of computing.
+
+    Attributes:
+        startup: until the first step, kernels from the cache.
+        compiling: of kernels, in this process; 0 where they were in the cache.
+        sampled: of stepping, in the sample from which the rest is told.
+        rest: of stepping, without contacts that form later.
+        output: frames, record and movie.
+        crowd: how many times as long stepping may take once flagella touch.
+    """
+
+    startup: float
+    compiling: float
+    sampled: float
+    rest: float
+    output: float
+    crowd: float
+
+    @property
+    def stepping(self) -> float:
+        return self.sampled + self.rest
+
+    @property
+    def least(self) -> float:
+        return self.startup + self.sampled + _LEAST * self.rest + self.output
+
+    @property
+    def most(self) -> float:
+        return self.startup + self.sampled + self.crowd * self.rest + self.output
+
+
+def needed(simulation: Simulation) -> Needed:
+    """Measured by starting the run; the simulation is advanced.
+
+    Raises:
+        NumericalError: a guard is violated in the first steps.
+    """
+    scene = simulation.scenes[0]
+    before = time.process_time()
+    simulation.prepare(recording=True)
+    startup = time.process_time()
+    compiling = startup - before if startup - before > _COLD else 0.0
+    nodes = int(simulation.first_node[-1])
+    output = scene.frames * (_observing(simulation) + _PER_FRAME + _MOVIE_PER_NODE * nodes) + _MOVIE
+    count = len(scene.resolved_flagella())
+    crowd = _FEW if count < 4 or not scene.steric.enabled else 1 + _PER_FLAGELLUM * (min(count, _CROWD) - 2)
+    spent, rest = _stepping(simulation)
+    if simulation.cell_state().steric_force > 0.0:
+        crowd = _FEW if count < 4 else _TOUCHING  # as they do already
+    return Needed(startup - compiling, compiling, spent, rest, output, crowd)
+
+
+def _observing(simulation: Simulation) -> float:
+    """Seconds for the observables of a frame."""
+    state, first_node = simulation.cell_state(), simulation.first_node
+    many = (_FRAMES_OBSERVED, 1, 1)
+    positions, directors = np.tile(state.positions, many), np.tile(state.directors, many)
+    began = time.process_time()
+    if len(first_node) > 2:
+        phase_differences(positions, directors, first_node)
+    bundle_lengths(positions, first_node)
+    return (time.process_time() - began) / _FRAMES_OBSERVED
+
+
+def _stepping(simulation: Simulation) -> tuple[float, float]:
+    """Seconds of computing that the sample took, and that the rest of the run takes at its last speed.
+
+    The sample is runs that double until one is long enough to time.
+    """
+    end = simulation.scenes[0].duration
+    reached, spent = 0.0, 0.0
+    until = min(_SETTLED / 4, end)
+    while True:
+        began = time.process_time()
+        simulation.advance(until)
+        taken = time.process_time() - began
+        spent += taken
+        settled = reached >= _SETTLED and taken > _SAMPLE_SECONDS
+        if settled or until >= end or spent > _MOST_SECONDS:
+            return spent, taken / (until - reached) * (end - until)
+        reached, until = until, min(2 * until, end)
