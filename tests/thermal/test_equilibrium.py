@@ -132,6 +132,17 @@ def test_goes_on_with_the_same_bits(stepper, precision, device):
     assert not np.array_equal(batch.cell_state(0).positions, whole.state.positions)
 
 
+@pytest.mark.parametrize("stepper", ["implicit", "euler"])
+def test_frames_are_ends_of_steps(stepper, device):
+    """Each at its time, and the last one is the state; steps are cut so that they end there."""
+    values = {"numerics.stepper": stepper, "numerics.time_step": 1e-8, "duration": 5.5e-8, "frames": 2}
+    sim = Simulation(cell({**PASSIVE, **values}), device=device)
+    frames = list(sim.frames(5.5e-8))
+    assert [frame.step for frame in frames] == [0, 3, 6]
+    assert np.allclose(frames[-1].positions, sim.state.positions, rtol=0, atol=1e-12)
+    assert not np.allclose(frames[-1].positions, frames[1].positions, rtol=0, atol=1e-12)
+
+
 def test_steppers_take_the_same_noise(device):
     """In short steps the implicit and the explicit step agree: the random elastic force vanishes with the step."""
     warm = {"fluid.temperature": 300.0, "numerics.time_step": 1e-12, "hydrodynamics.mode": "all", "motor.torque": 3.4}

@@ -247,6 +247,8 @@ class Run:
             "rejected_steps": copied["stepper.rejected"][0] if "stepper.rejected" in copied else 0,
             # Of the implicit stepper: steps attempted, each of two evaluations; of the others: right-hand sides.
             "evaluations": copied["stepper.evaluations"][0],
+            # Of thermal noise: products with the pair sum that its root took.
+            "noise_products": copied["stepper.noise_products"][0] if "stepper.noise_products" in copied else 0,
             "accuracy": accuracy_kept(scene, copied),
             "balance": {
                 "judged": getattr(simulation.stepper, "balanced", False),

@@ -22,7 +22,7 @@ from warpflag_kernels.implicit import (
     step_flow,
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
-from warpflag_kernels.stepping import health
+from warpflag_kernels.stepping import dense_output, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag_kernels.thermal import additive_chart, equilibrium, strain_gradients
@@ -133,6 +133,8 @@ class ThermalStepper:
         listed = parts.contacts if self._touching else None
         health.check(model, state, s.chart, s.guard, s.control, listed)
         equilibrium.decide(model, state, parts, explicit)
+        if self.dense is not None:
+            dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
         equilibrium.finish_step(model, state, parts, explicit)
@@ -186,8 +188,11 @@ class ThermalStepper:
         """A step knows nothing of those before it."""
 
     def memory(self) -> dict[str, np.ndarray]:
-        return {} if self.lanczos is None else {"products": self.lanczos.data.total.numpy().copy()}
+        kept = {"evaluations": self._system.control.steps.numpy().copy()}
+        if self.lanczos is not None:
+            kept["noise_products"] = self.lanczos.data.total.numpy().copy()
+        return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
-        for values in memory.values():
-            self.lanczos.data.total.assign(values)
+        if self.lanczos is not None:
+            self.lanczos.data.total.assign(memory["noise_products"])

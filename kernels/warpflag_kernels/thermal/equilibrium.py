@@ -163,7 +163,9 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
         control: Control,
     ):
         c = wp.tid()
-        if state.active[c] != 0 and (control.time[c] >= control.target[c] or control.fault[c] != no_fault):
+        if state.active[c] == 0:
+            return
+        if control.rest[c] != 0 or control.time[c] >= control.target[c] or control.fault[c] != no_fault:
             state.active[c] = 0
             wp.atomic_sub(control.unfinished, 0, 1)
 

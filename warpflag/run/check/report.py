@@ -8,6 +8,7 @@ import warp as wp
 from warpflag_kernels.stepping.right_hand_side import stages
 
 from warpflag.run.check.left_out import left_out
+from warpflag.run.check.noise import of_noise
 from warpflag.run.check.rigid import turning
 from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
@@ -47,6 +48,7 @@ def report(scene: Scene, device: str | None = None) -> str:
         f"stepper {scene.numerics.stepper}, step at most {longest:.3g} s",
         *_times(time, scene),
         *simulation.notes[0],
+        *of_noise(scene, longest),
     ]
     without = left_out(scene, turning(scene))
     return (

@@ -1,0 +1,39 @@
+"""What thermal noise does to a run, for `warpflag check`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from warpflag.scene import Scene
+from warpflag.scene.resistance import filament_mobility, thermal_energy
+
+__all__ = ["of_noise"]
+
+
+def of_noise(scene: Scene, step: float) -> list[str]:
+    """What thermal noise does to a run and asks of its step; nothing without a temperature."""
+    energy, numerics = thermal_energy(scene), scene.numerics
+    if energy == 0.0:
+        return []
+    spec = max(scene.resolved_flagella(), key=lambda spec: spec.length)
+    mobility = filament_mobility(scene, spec.segment_length)
+    # Of the straight line from anchor to tip, as a rod that turns about its anchor by its drag across.
+    long = spec.length * _axial_share(scene)
+    drag = long**3 / (3 * mobility.across * spec.segment_length)
+    tip = long * math.sqrt(4 * energy / drag * scene.duration)
+    method = "Euler-Maruyama" if numerics.stepper == "euler" else "linearly implicit with a random elastic force"
+    return [
+        f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
+        "joints hardly depend on the step, but driven motion errs in proportion to it: halve it and compare",
+        f"noise alone turns a flagellum about its hook: tip by about {tip:.2g} um in {1e3 * scene.duration:g} ms, "
+        f"{tip * math.sqrt(step / scene.duration):.1g} um in a step",
+    ]
+
+
+def _axial_share(scene: Scene) -> float:
+    """Axial length of the helix at rest over its contour length."""
+    curvature = np.array(scene.flagella.intrinsic_curvature)
+    size = float(np.linalg.norm(curvature))
+    return abs(float(curvature[2])) / size if size else 1.0
