@@ -12,16 +12,17 @@ from warpflag_kernels.base.plan import Plan, choose_plan
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, allocate_state, structs
 from warpflag_kernels.contact import neighbours
-from warpflag_kernels.fluid import rotne_prager
+from warpflag_kernels.fluid import rotne_prager, shell
 from warpflag_kernels.rod import comoving_chart
 from warpflag_kernels.stepping.terms import terms_named
 
 from warpflag.base import rotations
 from warpflag.model.geometry import InitialState
+from warpflag.model.shell import shell_mobility, shells_of
 from warpflag.model.terms import SCENE_TERMS, switches_of
 from warpflag.scene import Flagella, FlagellumSpec, Scene, SceneError, attachment
 from warpflag.scene.helix import rest_shape
-from warpflag.scene.resistance import filament_mobility, pair_radius, spheroid_mobility, steric_diameter
+from warpflag.scene.resistance import filament_mobility, pair_radii, spheroid_mobility, steric_diameter
 
 __all__ = ["build_chart", "build_control", "build_model", "build_state", "plan_of"]
 
@@ -98,16 +99,19 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
     m.drag.spin_mobility = reals([x.spin for x in mobility])
 
     if switches.pairs != "none":
-        m.pairs.radius = reals([pair_radius(scene) for scene in scenes])
+        m.pairs.radius = reals([a for scene in scenes for a in pair_radii(scene)])
         m.pairs.mobility = reals([1 / (8 * np.pi * scene.fluid.viscosity) for scene in scenes])
     m.steric.strength = reals([scene.steric.strength for scene in scenes])
     m.steric.diameter = reals([steric_diameter(scene) for scene in scenes])
 
     m.body.half_length = reals([(scene.body.length - scene.body.width) / 2 for scene in scenes])
     m.body.radius = reals([scene.body.width / 2 for scene in scenes])
-    along, across, spin, tumble = zip(*map(_body_mobility, scenes), strict=True)
-    m.body.mobility_along, m.body.mobility_across = reals(along), reals(across)
-    m.body.spin_mobility, m.body.tumble_mobility = reals(spin), reals(tumble)
+    if switches.flows.body:
+        m.body.shell_mobility = reals(np.concatenate([np.ravel(shell_mobility(scene)) for scene in scenes]))
+    else:
+        along, across, spin, tumble = zip(*map(_body_mobility, scenes), strict=True)
+        m.body.mobility_along, m.body.mobility_across = reals(along), reals(across)
+        m.body.spin_mobility, m.body.tumble_mobility = reals(spin), reals(tumble)
 
     for term in SCENE_TERMS:
         if term.fill is not None and switches.has(term.name):
@@ -121,12 +125,14 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
         element_count=len(flagellum_of),
         data=m,
         groups=simd.build(p, m.first_flagellum.numpy(), m.first_node.numpy(), device),
+        shells=shells_of(scenes) if switches.flows.body else None,
     )
 
 
 def build_state(model: DeviceModel) -> DeviceState:
     """Device arrays of one evaluation of the right-hand side, zero; a term that is off gets none."""
-    return DeviceState(allocate_state(model), rotne_prager.allocate(model), neighbours.allocate(model))
+    beads = shell.allocate(model, model.plan.pair_precision)
+    return DeviceState(allocate_state(model), rotne_prager.allocate(model), beads, neighbours.allocate(model))
 
 
 def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from warpflag_kernels.base.plan import Switches
+from warpflag_kernels.base.plan import Flows, Switches
 
 from warpflag.model.switching import corners
 from warpflag.record.cell_state import Evaluation
 from warpflag.scene import Scene
 from warpflag.scene.helix import rest_shape
+from warpflag.scene.resistance import pair_radii
 
 __all__ = ["SCENE_TERMS", "SceneTerm", "supplied_power", "switches_of"]
 
@@ -155,8 +156,9 @@ def switches_of(scene: Scene) -> Switches:
     if not scene.body.enabled and pairs == "within":
         pairs = "free"
     numerics = scene.numerics
+    unequal = pairs != "none" and len(set(pair_radii(scene))) > 1
     return Switches(
-        pairs=pairs,
+        flows=Flows(pairs, unequal=unequal, body=scene.hydrodynamics.body_flow),
         terms=tuple(term.name for term in SCENE_TERMS if term.needed(scene)),
         short_pairs=pairs != "none" and (numerics.precision, numerics.pair_precision) == ("float64", "float32"),
         noise=scene.fluid.temperature > 0.0,

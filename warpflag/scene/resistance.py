@@ -6,6 +6,7 @@ end that of h/2. The body moves by the mobility of a prolate spheroid of its asp
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ __all__ = [
     "SpheroidMobility",
     "filament_mobility",
     "pace",
+    "pair_radii",
     "pair_radius",
     "spheroid_mobility",
     "steric_diameter",
@@ -89,25 +91,67 @@ def spheroid_mobility(length: float, width: float, viscosity: float) -> Spheroid
     return SpheroidMobility(1 / (translation * xa), 1 / (translation * ya), 1 / (rotation * xc), 1 / (rotation * yc))
 
 
-def pair_radius(scene: Scene) -> float:
+def pair_radii(scene: Scene) -> list[float]:
+    """Radius of the Rotne-Prager pair term of every flagellum's nodes [um], see `pair_radius`."""
+    lengths = [spec.segment_length for spec in scene.resolved_flagella()]
+    found = {h: pair_radius(scene, h) for h in (set(lengths) if scene.hydrodynamics.mode == "consistent" else ())}
+    common = 0.0 if found else pair_radius(scene)
+    return [found.get(h, common) for h in lengths]
+
+
+def pair_radius(scene: Scene, segment_length: float | None = None) -> float:
     """Radius a of the Rotne-Prager pair term [um].
 
     As printed (the filament radius), a node's local mobility 1/(gamma_perp h) is below that of a bead of radius a
     once h > 6 pi eta a/gamma_perp, and the mobility of two nodes in contact has a negative eigenvalue: they attract
-    where they should repel. With a = max(filament radius, gamma_perp h/(6 pi eta)) it is positive definite.
+    where they should repel. With a = max(filament radius, gamma_perp h/(6 pi eta)) it is positive definite. Mode
+    consistent has a radius for every segment length, the others the one that the longest segment needs.
+
+    Args:
+        scene: gives drag, viscosity and hydrodynamics mode.
+        segment_length: h of the flagellum [um]; default: the longest.
 
     Raises:
-        SceneError: in mode consistent, segments too short for any radius.
+        SceneError: in mode consistent, segments too short for any radius; a given radius at which the mobility is not
+            positive definite.
     """
-    h = max(spec.segment_length for spec in scene.resolved_flagella())
-    radius, eta = scene.flagella.filament_radius, scene.fluid.viscosity
+    radius = scene.flagella.filament_radius
     if scene.hydrodynamics.pair_radius is not None:
+        _check_given(scene, scene.hydrodynamics.pair_radius)
         return scene.hydrodynamics.pair_radius
     if scene.hydrodynamics.mode == "as_printed":
         return radius
+    h = max(spec.segment_length for spec in scene.resolved_flagella())
     if scene.hydrodynamics.mode == "consistent":
-        return max(_consistent_radius(spec.segment_length, radius) for spec in scene.resolved_flagella())
-    return max(radius, _drag(scene)[1] * h / (6 * math.pi * eta))
+        return _consistent_radius(segment_length or h, radius)
+    return max(radius, _least_radius(scene, h))
+
+
+def _least_radius(scene: Scene, h: float) -> float:
+    """Radius of the bead that moves as easily as the local drag of a segment allows [um]."""
+    return max(_drag(scene)[:2]) * h / (6 * math.pi * scene.fluid.viscosity)
+
+
+def _check_given(scene: Scene, given: float) -> None:
+    """Refuses a pair radius with which some node would move less easily by itself than its bead does."""
+    mode, lengths = scene.hydrodynamics.mode, {spec.segment_length for spec in scene.resolved_flagella()}
+    radius = scene.flagella.filament_radius
+
+    def sound(a_pair: float) -> bool:
+        if mode == "consistent":
+            return all(_positive(h, radius, a_pair) for h in lengths)
+        return a_pair >= _SOUND * _least_radius(scene, max(lengths))
+
+    if mode not in ("all", "within", "consistent") or sound(given):
+        return
+    least = _least_radius(scene, max(lengths))
+    if mode == "consistent":
+        least = max(_consistent_radius(h, radius) for h in lengths)
+    enough = math.ceil(1e4 * least - 1e-6) / 1e4
+    problem = f"makes the mobility indefinite; {enough:g} um is the least that does not"
+    if not sound(enough):
+        problem = "makes the mobility indefinite, as any does for all of the scene's segment lengths; leave it out"
+    raise SceneError("hydrodynamics.pair_radius", given, problem, ["flagella.segment_length", "hydrodynamics.mode"])
 
 
 def steric_diameter(scene: Scene) -> float:
@@ -133,12 +177,7 @@ def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
     h = segment_length
     if scene.hydrodynamics.mode != "consistent":
         return FilamentMobility(1 / (parallel * h), 1 / (perpendicular * h), 1 / (rotation * h))
-    a_pair = pair_radius(scene)
-    along, across = _slender_body(h, scene.flagella.filament_radius, a_pair)
-    # A pair radius of the scene's own may attract at contact; a node that moves against its force is never right.
-    if min(along, across) < (_SOUND * 2 / 3 * h / a_pair if scene.hydrodynamics.pair_radius is None else 1e-9):
-        problem = f"is too short beside a pair radius of {a_pair:.3g} um, as longer segments take in mode consistent"
-        raise SceneError("flagella.segment_length", h, problem, ["hydrodynamics.mode", "hydrodynamics.pair_radius"])
+    along, across = _slender_body(h, scene.flagella.filament_radius, pair_radius(scene, h))
     scale = 1 / (4 * math.pi * scene.fluid.viscosity * h)
     return FilamentMobility(scale * along, scale * across, 1 / (rotation * h))
 
@@ -195,10 +234,16 @@ def _slender_body(h: float, radius: float, a_pair: float) -> tuple[float, float]
     return 2 * log + 4 / 3 * ratio, 1 + log - 2 / 3 * ratio
 
 
+@functools.cache
 def _consistent_radius(h: float, radius: float) -> float:
     """Smallest pair radius that keeps the consistent mobility positive definite [um]."""
     for a_pair in np.linspace(min(radius, h / 2), h / 2, 400):
-        if min(_slender_body(h, radius, a_pair)) >= 2 / 3 * h / a_pair:
+        if _positive(h, radius, a_pair):
             return float(a_pair)
     problem = f"must be at least about {2.6 * radius:.3g} um in mode consistent (2.6 filament radii)"
     raise SceneError("flagella.segment_length", h, problem, ["hydrodynamics.mode"])
+
+
+def _positive(h: float, radius: float, a_pair: float) -> bool:
+    """Whether a node's local mobility in mode consistent is no less than that of its bead, 1/(6 pi eta a_pair)."""
+    return min(_slender_body(h, radius, a_pair)) >= 2 / 3 * h / a_pair

@@ -108,7 +108,7 @@ class Scene(Section, key=""):
         for check in (
             self._check_body,
             self._check_step,
-            self._check_pair_radius,
+            self._check_flows,
             self._check_start,
             self._check_hook,
             self._check_noise,
@@ -166,12 +166,18 @@ class Scene(Section, key=""):
             problem = f"must not be above duration = {self.duration:g} s"
             raise SceneError("numerics.time_step", step, problem, ["duration"])
 
-    def _check_pair_radius(self) -> None:
+    def _check_flows(self) -> None:
         radius, mode = self.hydrodynamics.pair_radius, self.hydrodynamics.mode
         if radius is not None and mode in ("none", "as_printed"):
             why = "sums no pairs" if mode == "none" else "takes flagella.filament_radius"
             problem = f"must be absent: hydrodynamics.mode = {mode} {why}"
             raise SceneError("hydrodynamics.pair_radius", radius, problem, ["hydrodynamics.mode"])
+
+        if self.hydrodynamics.body_flow and mode not in ("all", "consistent"):
+            problem = f"needs hydrodynamics.mode all or consistent, not {mode}"
+            raise SceneError("hydrodynamics.body_flow", True, problem, ["hydrodynamics.mode"])
+        if self.hydrodynamics.body_flow and not self.body.enabled:
+            raise SceneError("hydrodynamics.body_flow", True, "needs a body: body.enabled = false", ["body.enabled"])
 
     def _check_hook(self) -> None:
         if self.hook.stiffness and not self.motor.bearing_torque:

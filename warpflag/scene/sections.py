@@ -219,8 +219,14 @@ class Hydrodynamics(Section, key="hydrodynamics"):
         1,
         "radius of the Rotne-Prager pair term",
         derived="filament_radius with as_printed, else the least that keeps the mobility positive definite; "
-        "that is max(filament_radius, drag_perpendicular h / (6 pi viscosity)) unless consistent, h the "
-        "longest segment",
+        "that is max(filament_radius, drag_perpendicular h / (6 pi viscosity)) unless consistent, h that of the "
+        "segment, the longest one unless consistent",
+    )
+    body_flow: bool = switch(
+        False, "the body's surface obstructs the flow of the flagella and carries fluid along; with all and consistent"
+    )
+    body_beads: int = integer(
+        60, 20, 2000, "beads of the body's surface with body_flow; the more, the better the flow beside the body"
     )
 
 

@@ -208,7 +208,7 @@ class ImplicitStepper:
         forces.total_forces(model, state, self._smooth_terms)
         if self._touching:
             contact_list.act(model, state, self.contacts, self.law.force)
-        body.body_motion(model, state, self._terms)
+        body.body_motion(model, state, self._terms, single=self.flow.shell if in_single else None)
         if in_single:
             step_flow.single_velocities(model, state, self.flow)
         else:

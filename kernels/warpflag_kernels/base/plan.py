@@ -19,21 +19,56 @@ STORED_NODES = 512
 
 
 @dataclass(frozen=True)
-class Switches:
-    """The terms that the scenes of a batch ask for. What is off is not compiled, allocated or launched.
+class Flows:
+    """Which flows act, as kernels are compiled for them.
 
     Attributes:
         pairs: which nodes the Rotne-Prager sum couples: "none", "within" one flagellum, "between" flagella, or "all";
             "free": those of a free filament, r_0 among them.
+        unequal: whether the nodes of a cell have unequal pair radii.
+        body: whether the body's surface obstructs the flow and carries it along.
+    """
+
+    pairs: str
+    unequal: bool = False
+    body: bool = False
+
+    @property
+    def variant(self) -> str:
+        """Name of the choice, for kernel modules."""
+        return "_".join([self.pairs, *["unequal"] * self.unequal, *["body"] * self.body])
+
+    @property
+    def within(self) -> bool:
+        """Whether nodes of one flagellum are coupled."""
+        return self.pairs in ("within", "all", "free")
+
+    @property
+    def between(self) -> bool:
+        """Whether nodes of different flagella are coupled."""
+        return self.pairs in ("between", "all")
+
+
+@dataclass(frozen=True)
+class Switches:
+    """The terms that the scenes of a batch ask for. What is off is not compiled, allocated or launched.
+
+    Attributes:
+        flows: which flows act.
         terms: names of the force terms, see `warpflag_kernels.stepping.terms`.
         short_pairs: whether a float64 run has the pairs of the sum in float32, and their sums in float64.
         noise: whether there is thermal noise.
     """
 
-    pairs: str
+    flows: Flows
     terms: tuple[str, ...]
     short_pairs: bool = False
     noise: bool = False
+
+    @property
+    def pairs(self) -> str:
+        """Which nodes the Rotne-Prager sum couples."""
+        return self.flows.pairs
 
     def has(self, term: str) -> bool:
         """Whether a force term is on."""

@@ -84,10 +84,10 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Pairs:
-        """Rotne-Prager sum, per cell [C]."""
+        """Rotne-Prager sum."""
 
-        radius: wp.array(dtype=real)  # a [um]
-        mobility: wp.array(dtype=real)  # 1/(8 pi eta) [um^2/(s pN)]
+        radius: wp.array(dtype=real)  # [K], a, of the nodes of a flagellum [um]
+        mobility: wp.array(dtype=real)  # [C], 1/(8 pi eta) [um^2/(s pN)]
 
     @wp.struct
     class Steric:
@@ -98,7 +98,7 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Body:
-        """Per cell [C]: the capsule that contact sees, and the mobility of the spheroid."""
+        """Per cell [C]: the capsule that contact sees, and the mobility of the spheroid or of its shell of beads."""
 
         half_length: wp.array(dtype=real)  # of the capsule's axis [um]
         radius: wp.array(dtype=real)  # [um]
@@ -106,6 +106,9 @@ def structs(p: Precision) -> SimpleNamespace:
         mobility_across: wp.array(dtype=real)
         spin_mobility: wp.array(dtype=real)  # about its axis [1/(pN um s)]
         tumble_mobility: wp.array(dtype=real)  # about an axis across it [1/(pN um s)]
+        # [36 C], of a shell of beads, from force and torque to velocity and spin in body axes, row after row; then
+        # without the four above.
+        shell_mobility: wp.array(dtype=real)
 
     @wp.struct
     class External:
@@ -180,6 +183,8 @@ def structs(p: Precision) -> SimpleNamespace:
         velocity: wp.array(dtype=vec3)  # [E], of the node, lab [um/s]
         flagellum_force: wp.array(dtype=vec3)  # [K], of a flagellum on the body [pN]
         flagellum_torque: wp.array(dtype=vec3)  # [K], about the body centre [pN um]
+        surface_force: wp.array(dtype=vec3)  # [C], of the flow on the body when it is held [pN]; only with body flow
+        surface_torque: wp.array(dtype=vec3)  # [C], about its centre [pN um]
         body_velocity: wp.array(dtype=vec3)  # [C] [um/s]
         body_spin: wp.array(dtype=vec3)  # [C] [rad/s]
 
@@ -197,6 +202,7 @@ class DeviceModel:
         cell_count, flagellum_count, element_count: sizes C, K, E.
         data: the struct `Model`.
         groups: the struct `Groups`: flagella side by side in vector lanes.
+        shells: beads of the bodies on the host, `warpflag_kernels.fluid.body_flow.Shells`; None without body flow.
     """
 
     plan: Plan
@@ -207,6 +213,7 @@ class DeviceModel:
     element_count: int
     data: Any
     groups: Any
+    shells: Any = None
 
     @property
     def precision(self) -> Precision:
@@ -234,11 +241,13 @@ class DeviceState:
     Attributes:
         data: the struct `State`.
         pairs: the struct `PairSum` of the Rotne-Prager sum.
+        shell: the struct `Shell` of the flow round the body.
         neighbours: the struct `Neighbours` of the steric force.
     """
 
     data: Any
     pairs: Any
+    shell: Any
     neighbours: Any
 
 
@@ -271,6 +280,8 @@ def allocate_state(model: DeviceModel) -> Any:
         s.body_contact = zeros(elements, p.vec3)
     s.force, s.velocity, s.spin_torque = zeros(elements, p.vec3), zeros(elements, p.vec3), zeros(elements, p.real)
     s.flagellum_force, s.flagellum_torque = zeros(flagella, p.vec3), zeros(flagella, p.vec3)
+    if model.switches.flows.body:
+        s.surface_force, s.surface_torque = zeros(cells, p.vec3), zeros(cells, p.vec3)
     s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
     if model.timed:
         s.time = zeros(cells, wp.float64)

@@ -1,27 +1,50 @@
 """The cell body: sums the forces and torques of the flagella on it and moves by the mobility of a prolate spheroid.
 
+With flow round the body it moves by the mobility of its shell of beads, and the flow of the nodes takes it along.
+
 Each flagellum exerts the force at its anchor, with its torque about the body's centre, and what the terms put on
 the body directly: the motor's reaction, the bearing torque, the reaction to the contact of its nodes with the surface.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.fluid import body_flow
 
 
 @functools.cache
 def mobility(p: Precision) -> SimpleNamespace:
     """Device function `respond`: velocity and angular velocity of a body under a force and a torque."""
-    vec3, Model, State = p.vec3, structs(p).Model, structs(p).State
+    real, vec3, Model, State = p.real, p.vec3, structs(p).Model, structs(p).State
+    module = p.module("body_mobility")
 
-    @wp.func(module=p.module("body_mobility"))
+    @wp.func(module=module)
+    def respond_as_shell(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
+        q = state.pose.body_orientation[c]
+        axes = wp.quat_to_matrix(p.quat(real(q[0]), real(q[1]), real(q[2]), real(q[3])))
+        f = wp.transpose(axes) * force
+        t = wp.transpose(axes) * torque
+        u = vec3(real(0.0))
+        w = vec3(real(0.0))
+        for i in range(3):
+            for j in range(3):
+                at = 36 * c + 6 * i + j
+                u[i] += model.body.shell_mobility[at] * f[j] + model.body.shell_mobility[at + 3] * t[j]
+                w[i] += model.body.shell_mobility[at + 18] * f[j] + model.body.shell_mobility[at + 21] * t[j]
+        return axes * u, axes * w
+
+    @wp.func(module=module)
     def respond(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
         """Velocity [um/s] and angular velocity [rad/s] of the body of cell c; torque about its centre."""
+        if model.body.shell_mobility.shape[0] > 0:
+            u, w = respond_as_shell(model, state, c, force, torque)
+            return u, w
         axis = state.pose.body_axis[c]
         force_along = wp.dot(axis, force) * axis
         torque_along = wp.dot(axis, torque) * axis
@@ -53,6 +76,9 @@ def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     def move(model: Model, state: State, c: wp.int32):
         force = vec3(real(0.0))
         torque = vec3(real(0.0))
+        if state.surface_force.shape[0] > 0:
+            force = state.surface_force[c]
+            torque = state.surface_torque[c]
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             force += state.flagellum_force[k]
@@ -120,22 +146,47 @@ def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
 
 
+def obstruct(model: DeviceModel, state: DeviceState, single: Any = None) -> None:
+    """What the flow of the nodes does to bodies that are held, into `surface_force` and `surface_torque`.
+
+    Args:
+        model, state: of the batch.
+        single: the struct `Shell` in single precision, with nodes in their places, instead of the state's.
+    """
+    if single is not None:
+        body_flow.obstruct(model, state, single, model.precision.single, placed=True)
+    else:
+        body_flow.obstruct(model, state, state.shell, model.plan.pair_precision)
+
+
 def move_bodies(model: DeviceModel, state: DeviceState) -> None:
-    """Velocity and angular velocity of every body from `flagellum_force` and `flagellum_torque`."""
+    """Velocity and angular velocity of every body from `flagellum_force` and `flagellum_torque`, and, with flow round
+    the body, from the forces on nodes."""
+    if model.switches.flows.body:
+        obstruct(model, state)
+    _move(model, state)
+
+
+def _move(model: DeviceModel, state: DeviceState) -> None:
     kernel = _kernels(model.precision, model.terms).move
     wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
-def body_motion(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...] | None = None) -> None:
+def body_motion(
+    model: DeviceModel, state: DeviceState, terms: tuple[Term, ...] | None = None, single: Any = None
+) -> None:
     """Velocity [um/s] and angular velocity [rad/s] of every body, into `body_velocity` and `body_spin`.
 
     Args:
         model, state: of the batch.
         terms: those that count; default: all of the model.
+        single: the struct `Shell` in single precision, with nodes in their places, instead of the state's.
     """
     terms = model.terms if terms is None else terms
     sum_flagella(model, state, terms)
+    if model.switches.flows.body:
+        obstruct(model, state, single)
     if any(hasattr(term.functions(model.precision), "settle") for term in terms):
         kernel = _kernels(model.precision, terms).settle
         wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
-    move_bodies(model, state)
+    _move(model, state)

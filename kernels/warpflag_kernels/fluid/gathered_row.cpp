@@ -9,7 +9,7 @@ for (int j = begin; j < end; j += THREADS) {
     const REAL dx = xi - s.x.data[j], dy = yi - s.y.data[j], dz = zi - s.z.data[j];
     const REAL fx = s.fx.data[j], fy = s.fy.data[j], fz = s.fz.data[j];
     REAL c, d;
-    tensor(dx * dx + dy * dy + dz * dz, c, d);
+    tensor(dx * dx + dy * dy + dz * dz, j, c, d);
     const REAL other = j == i ? REAL(0) : REAL(1);
     const REAL along = other * d * (dx * fx + dy * fy + dz * fz);
     c = other * c;

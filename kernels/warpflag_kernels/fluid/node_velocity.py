@@ -1,4 +1,4 @@
-"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum.
+"""Node velocities: local anisotropic drag plus the Rotne-Prager pair sum, plus the flow of the body's surface.
 
 Local (the paper's mu_t): [t t/gamma_par + (I - t t)/gamma_perp]/h per node (h/2 at the free end), t the normalised
 sum of the adjacent tangents, at the last node the last segment's.
@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.plan import WARP
+from warpflag_kernels.base.plan import WARP, Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.fluid import rotne_prager
+from warpflag_kernels.fluid import body_flow, rotne_prager
 
 
 @functools.cache
@@ -36,11 +36,11 @@ def local(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
+def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
     """Device functions: velocities of one node, and of all nodes of a cell."""
     Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
-    module = p.module("mobility_functions", _variant(p, pair, pairs, form))
-    sums = rotne_prager.functions(p, pair, pairs, form)
+    module = p.module("mobility_functions", _variant(p, pair, flows, form))
+    sums = rotne_prager.functions(p, pair, flows, form)
     add_cell, flow_at = sums.add_cell, sums.flow_at
 
     drag_velocity = local(p).drag_velocity
@@ -48,17 +48,17 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
     @wp.func(module=module)
     def move_node(model: Model, state: State, s: PairSum, e: wp.int32, k: wp.int32, c: wp.int32, thread: wp.int32):
         """Velocity of node e of flagellum k of cell c; the threads of a warp share its pairs."""
-        if wp.static(pairs != "free") and e == model.first_node[k]:
+        if wp.static(flows.pairs != "free") and e == model.first_node[k]:
             state.velocity[e] = state.body_velocity[c] + wp.cross(state.body_spin[c], state.pose.position[e])
             return
         v = drag_velocity(model, state, e, k)
-        if wp.static(pairs == "free") and e == model.first_node[k]:
+        if wp.static(flows.pairs == "free") and e == model.first_node[k]:
             v = state.body_velocity[c]  # a free end, by its local mobility so far
-        if wp.static(pairs != "none"):
+        if wp.static(flows.pairs != "none"):
             v += model.pairs.mobility[c] * flow_at(model, s, e, k, c, thread)
         if thread == 0:
             state.velocity[e] = v
-            if wp.static(pairs == "free") and e == model.first_node[k]:
+            if wp.static(flows.pairs == "free") and e == model.first_node[k]:
                 state.body_velocity[c] = v
 
     @wp.func(module=module)
@@ -76,12 +76,12 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
 
 
 @functools.cache
-def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
+def _kernels(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
     vec3, real = p.vec3, pair.real
     Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
-    f = functions(p, pair, pairs, form)
+    f = functions(p, pair, flows, form)
     move_node, move_cell = f.move_node, f.move_cell
-    module = p.module("mobility", _variant(p, pair, pairs, form))
+    module = p.module("mobility", _variant(p, pair, flows, form))
 
     @wp.kernel(module=module)
     def pack(
@@ -95,7 +95,7 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
         e = wp.tid()
         x = state.pose.position[e]
         force = state.force[e]
-        if wp.static(pairs != "free") and e == model.first_node[model.flagellum_of[e]]:
+        if wp.static(flows.pairs != "free") and e == model.first_node[model.flagellum_of[e]]:
             force = vec3(p.real(0.0))
         s.x[e] = real(x[0])
         s.y[e] = real(x[1])
@@ -137,18 +137,28 @@ def _kernels(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleName
     return kernels
 
 
-def _variant(p: Precision, pair: Precision, pairs: str, form: str) -> str:
-    return "_".join([pairs, form, *["short"] * (pair != p)])
+def _variant(p: Precision, pair: Precision, flows: Flows, form: str) -> str:
+    return "_".join([flows.variant, form, *["short"] * (pair != p)])
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
-    """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion."""
+    """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion, and with flow
+    round the body its held loads."""
     plan, device = model.plan, model.device
-    kernels = _kernels(model.precision, plan.pair_precision, model.switches.pairs, plan.pair_sum)
+    flows = model.switches.flows
+    kernels = _kernels(model.precision, plan.pair_precision, flows, plan.pair_sum)
     inputs = [model.data, state.data, state.pairs]
     if plan.pair_sum == "symmetric":
         wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)
-        return
+    else:
+        _gather(model, state, kernels)
+    if flows.body:
+        body_flow.carry(model, state, state.shell, plan.pair_precision)
+
+
+def _gather(model: DeviceModel, state: DeviceState, kernels: SimpleNamespace) -> None:
+    plan, device = model.plan, model.device
+    inputs = [model.data, state.data, state.pairs]
     if plan.pair_sum != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
     threads = plan.gathering_threads

@@ -4,7 +4,9 @@
     r <= 2a:  1/(6 pi eta a) [(1 - 9r/32a) I + (3r/32a) rr]
 
 It runs over the distinct nodes of the same flagellum, of the others, or both, as the scene says. r_0 belongs to the
-body: it moves with the body and its force enters the sum as zero. Only in a free filament it is a node like others.
+body: it moves with the body and its force enters the sum as zero; only in a free filament it is a node like others.
+Nodes of unequal radii have the tensor of two spheres of two radii (Zuk, Wajnryb, Mizerski & Szymczak, J. Fluid Mech.
+741, R5 (2014)), which costs more and is compiled only where a scene has them.
 
 On a GPU the threads of a warp gather the flows at one node together, an order of magnitude faster than a thread for
 each node, of which a cell has too few. A CPU, where one thread does a whole cell, takes every pair once for both nodes
@@ -21,7 +23,7 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels.base.native import native
-from warpflag_kernels.base.plan import WARP
+from warpflag_kernels.base.plan import WARP, Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, structs
 
@@ -43,6 +45,7 @@ def struct(p: Precision) -> Any:
         fx: wp.array(dtype=real)  # force, zero on r_0 [pN]
         fy: wp.array(dtype=real)
         fz: wp.array(dtype=real)
+        radius: wp.array(dtype=real)  # a of the node [um]; only where radii are unequal
         ux: wp.array(dtype=real)  # 8 pi eta times the velocity [pN/um]; only of the symmetric sum
         uy: wp.array(dtype=real)
         uz: wp.array(dtype=real)
@@ -67,24 +70,35 @@ def allocate(model: DeviceModel) -> Any:
                 setattr(sums, name, wp.zeros(model.element_count, dtype=wp.float64, device=model.device))
     for name in names:
         setattr(sums, name, wp.zeros(model.element_count, dtype=p.real, device=model.device))
+    if model.switches.flows.unequal:
+        radii = model.data.pairs.radius.numpy()[model.data.flagellum_of.numpy()]
+        sums.radius = wp.array(radii, dtype=p.real, device=model.device)
     return sums
 
 
-def tensor_code(p: Precision) -> str:
-    """C++ that defines tensor(r2, c, d) for a pair radius `a`: the one place of the law."""
+def tensor_code(p: Precision, unequal: bool, sums: str) -> str:
+    """C++ that defines tensor(r2, j, c, d) of node i: the one place of the law.
+
+    Args:
+        p: precision of the pairs.
+        unequal: with the radii of the struct `PairSum`; else of two nodes of radius `a`.
+        sums: the name of that struct there.
+    """
+    if unequal:
+        return native(__file__, "unequal_row", p, UNEQUAL=native(__file__, "unequal_tensor", p), SUM=sums)
     return native(__file__, "rotne_prager_tensor", p)
 
 
 @functools.cache
-def rows(p: Precision, threads: int = 1) -> SimpleNamespace:
+def rows(p: Precision, unequal: bool, threads: int = 1) -> SimpleNamespace:
     """Device functions of one row of pairs: `add_row` counts them at both nodes, `gather_pairs` at one, where so many
     threads take turns."""
-    real, vec3, PairSum = p.real, p.vec3, struct(p)
+    real, vec3, PairSum, tensor = p.real, p.vec3, struct(p), tensor_code(p, unequal, "s")
 
-    @wp.func_native(native(__file__, "symmetric_row", p, TENSOR=tensor_code(p)))
+    @wp.func_native(native(__file__, "symmetric_row", p, TENSOR=tensor))
     def add_row(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real): ...
 
-    @wp.func_native(native(__file__, "gathered_row", p, TENSOR=tensor_code(p), THREADS=threads))
+    @wp.func_native(native(__file__, "gathered_row", p, TENSOR=tensor, THREADS=threads))
     def gather_pairs(s: PairSum, i: wp.int32, begin: wp.int32, end: wp.int32, a: real) -> vec3: ...
 
     return SimpleNamespace(add_row=add_row, gather_pairs=gather_pairs)
@@ -102,21 +116,22 @@ def over_warp(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNamespace:
+def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
     """Device functions: the symmetric sum of a cell, and the flow at a node in units of 1/(8 pi eta).
 
     Args:
         p: precision of the run.
         pair: precision of the terms.
-        pairs: which nodes are coupled, `Switches.pairs`, but not "none".
+        flows: which nodes are coupled, but not "none".
         form: `Plan.pair_sum`: "symmetric", "warp" or "thread".
     """
     vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
     Model, State, PairSum = structs(p).Model, structs(p).State, struct(pair)
-    module = p.module("pair_sum", "_".join([pairs, form, *["short"] * short]))
-    within, between = pairs in ("within", "all", "free"), pairs in ("between", "all")
+    module = p.module("pair_sum", "_".join([flows.variant, form, *["short"] * short]))
+    within, between = flows.within, flows.between
     symmetric, threads = form == "symmetric", WARP if form == "warp" else 1
-    add_row, gather_pairs, warp_sum = rows(pair, threads).add_row, rows(pair, threads).gather_pairs, over_warp(p)
+    row = rows(pair, flows.unequal, threads)
+    add_row, gather_pairs, warp_sum = row.add_row, row.gather_pairs, over_warp(p)
 
     @wp.func_native(native(__file__, "pack_cell", pair, RUN=p.c_name))
     def pack_cell(
@@ -131,10 +146,10 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
         """Pair sum of cell c, every pair once for both nodes."""
         begin = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
-        a = real(model.pairs.radius[c])
+        a = real(model.pairs.radius[model.first_flagellum[c]])
         pack_cell(state.pose.position, state.force, s, begin, end)
         k = model.first_flagellum[c]
-        while wp.static(pairs != "free") and k < model.first_flagellum[c + 1]:
+        while wp.static(flows.pairs != "free") and k < model.first_flagellum[c + 1]:
             i = model.first_node[k]
             s.fx[i] = real(0.0)
             s.fy[i] = real(0.0)
@@ -188,7 +203,7 @@ def functions(p: Precision, pair: Precision, pairs: str, form: str) -> SimpleNam
             end = model.first_node[k + 1]
             cell_begin = model.first_node[model.first_flagellum[c]]
             cell_end = model.first_node[model.first_flagellum[c + 1]]
-            a = real(model.pairs.radius[c])
+            a = real(model.pairs.radius[model.first_flagellum[c]])
             v = vec3()
             if wp.static(within and between):
                 v = gather(s, e, cell_begin + thread, cell_end, a)

@@ -9,7 +9,7 @@ REAL ui = 0, vi = 0, wi = 0;
 const auto add_pair = [&](int j) {
     const REAL dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
     REAL c, d;
-    tensor(dx * dx + dy * dy + dz * dz, c, d);
+    tensor(dx * dx + dy * dy + dz * dz, j, c, d);
     const REAL dj = d * (dx * F[j] + dy * G[j] + dz * H[j]), di = d * (dx * fi + dy * gi + dz * hi);
     ui += c * F[j] + dj * dx; vi += c * G[j] + dj * dy; wi += c * H[j] + dj * dz;
     U[j] += c * fi + di * dx; V[j] += c * gi + di * dy; W[j] += c * hi + di * dz;

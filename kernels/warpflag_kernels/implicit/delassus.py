@@ -17,9 +17,11 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, structs
 from warpflag_kernels.contact import contact_list
+from warpflag_kernels.fluid import body_flow
 from warpflag_kernels.implicit import block_band, body_coupling
 from warpflag_kernels.implicit import step_flow as flow_stage
 from warpflag_kernels.rod import chain_chart
@@ -135,21 +137,80 @@ def reductions(p: Precision, threads: int) -> SimpleNamespace:
 
 
 @functools.cache
-def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) -> SimpleNamespace:
+def functions(p: Precision, flows: Flows, form: str, chains: str, threads: int) -> SimpleNamespace:
     """Device functions of one block of so many threads: sums and maxima over them, and the product."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
     Flow, vec6 = flow_stage.struct(p), chain_chart.types(p).vec6
-    flows = flow_stage.functions(p, pairs, form)
-    load, spread, flow_at, loaded_end = flows.load, flows.spread, flows.flow_at, flows.loaded_end
+    sums = flow_stage.functions(p, flows, form)
+    load, spread, flow_at, loaded_end = sums.load, sums.spread, sums.flow_at, sums.loaded_end
     band_functions, body_rate = block_band.functions(p), body_coupling.functions(p).body_rate
     drag, solve_flagellum = band_functions.drag, band_functions.solve_flagellum
     solve_cell, follow = band_functions.solve_cell, band_functions.follow
     jacobian = contact_list.functions(p)
     gap_change, body_load = jacobian.gap_change, jacobian.body_load
     segment_loads, node_loads = jacobian.segment_loads, jacobian.node_loads
-    module = p.module("delassus", f"{pairs}_{form}_{chains}_{threads}")
+    stored = form != "gathered"
+    beads = body_flow.functions(p, p.single, stored)
+    axes_of, pull, answer, bead_flow = beads.axes_of, beads.pull, beads.answer, beads.flow_at_bead
+    hold_row, sum_loads, load_rows, flow_at_node = beads.hold_row, beads.sum_loads, beads.load_rows, beads.flow_at_node
+    module = p.module("delassus", f"{flows.variant}_{form}_{chains}_{threads}")
+
+    @wp.func(module=module)
+    def held(flow: Flow, c: wp.int32):
+        """Force and torque of the flow on a body that is held."""
+        f = flow.shell.force[c]
+        t = flow.shell.torque[c]
+        return vec6(real(f[0]), real(f[1]), real(f[2]), real(t[0]), real(t[1]), real(t[2]))
+
+    @wp.func(module=module)
+    def load_beads(
+        model: Model, state: State, contacts_in: Contacts, flow: Flow, law: Law, c: wp.int32, thread: wp.int32
+    ):  # fmt: skip
+        """Loads on the beads of the body under the contact forces, and their resultant when it is held."""
+        axes = axes_of(state, c)
+        k = model.first_flagellum[c] + thread
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k] + 1
+            while e < model.first_node[k + 1]:
+                pull(flow.shell, e, axes, law.on_node[e])
+                e += 1
+            k += threads
+        meet()
+        rows = 3 * (flow.shell.first[c + 1] - flow.shell.first[c])
+        if wp.static(stored):
+            answer(model, flow.shell, c)
+        else:
+            i = int(thread)
+            while i < rows / 3:
+                bead_flow(model, flow.shell, c, i)
+                i += threads
+            meet()
+            i = int(thread)
+            while i < rows:
+                hold_row(flow.shell, c, i)
+                i += threads
+            meet()
+        if thread == 0:
+            sum_loads(flow.shell, c, axes)
+        meet()
+        total = held(flow, c)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            total += body_load(model, state, contacts_in, law.load, k, law.on_node[model.first_node[k]])
+            k += 1
+        motion = body_rate(model, state, c, total)
+        u = vec3(motion[0], motion[1], motion[2])
+        w = vec3(motion[3], motion[4], motion[5])
+        if wp.static(threads == 1):
+            load_rows(model, flow.shell, c, axes, u, w, 0, rows)
+        else:
+            i = int(thread)
+            while i < rows:
+                load_rows(model, flow.shell, c, axes, u, w, i, i + 1)
+                i += threads
+            meet()
 
     @wp.func(module=module)
     def product(
@@ -188,7 +249,7 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
                     f += law.on_first[e + 1]  # zero where the next element is a tripod
                 law.on_node[e] = f
                 e += threads
-        if wp.static(pairs != "none"):
+        if wp.static(flows.pairs != "none"):
             e = begin + thread
             while e < end:
                 if flow.slot[e] >= 0:
@@ -197,6 +258,9 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
         meet()
         if wp.static(form != "gathered"):
             spread(model, flow, c, loaded_end(model, flow, c))
+        if wp.static(flows.body):
+            load_beads(model, state, contacts_in, flow, law, c, thread)
+            axes = axes_of(state, c)
         gain = real(law.gain[c])
         e = begin + thread
         while e < end:
@@ -204,8 +268,11 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
             f = vec3(real(0.0))
             if e > model.first_node[k]:
                 f = law.on_node[e]
-                if wp.static(pairs != "none"):
-                    f += drag(band, e, flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0))
+                if wp.static(flows.pairs != "none"):
+                    v = flow_at(model, flow, e, k, c, loaded_end(model, flow, c), 0)
+                    if wp.static(flows.body):
+                        v += flow_at_node(model, flow.shell, e, k, c, axes)
+                    f += drag(band, e, v)
                 f = gain * f
             law.response.node[e] = vec4(f[0], f[1], f[2], real(0.0))
             e += threads
@@ -227,6 +294,8 @@ def functions(p: Precision, pairs: str, form: str, chains: str, threads: int) ->
         meet()
         if thread == 0:
             total = vec6(real(0.0))
+            if wp.static(flows.body):
+                total = gain * held(flow, c)
             k = k_begin
             while k < k_end:
                 total += law.on_body[k]

@@ -18,16 +18,18 @@ import numpy as np
 import warp as wp
 
 from warpflag_kernels.base.native import native
+from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list
-from warpflag_kernels.fluid import node_velocity, rotne_prager
+from warpflag_kernels.fluid import body_flow, node_velocity, rotne_prager
+from warpflag_kernels.fluid import shell as shell_stage
 
 
 @functools.cache
 def struct(p: Precision) -> Any:
     """The struct `StepFlow`: the order of nodes in the sum, and the coefficients of their pairs."""
-    PairSum, single = rotne_prager.struct(p.single), p.single.real
+    PairSum, Shell, single = rotne_prager.struct(p.single), shell_stage.struct(p.single), p.single.real
 
     @wp.struct
     class StepFlow:
@@ -37,6 +39,7 @@ def struct(p: Precision) -> Any:
         node: wp.array(dtype=wp.int32)  # [E], node of a slot; a cell's slots begin where its elements do
         slot: wp.array(dtype=wp.int32)  # [E], slot of a node; -1: of r_0, which is not in the sum
         sum: PairSum  # by slot
+        shell: Shell  # of the flow round the body; by node
         # Coefficients c, q of the pairs, flow = c f + q (q . f); only where they are stored.
         first_pair: wp.array(dtype=wp.int32)  # [C], of a cell's pairs
         c: wp.array(dtype=single)  # [pairs], of the force [1/um]
@@ -61,19 +64,19 @@ def rows(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNamespace:
+def functions(p: Precision, flows: Flows, form: str, threads: int = 1) -> SimpleNamespace:
     """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
     `spread` where pairs are taken once, then `flow_at` any node; for one `Plan.step_pairs`. Threads: those
     that share what is gathered at a node, one or those of a warp."""
     real, vec3, single = p.real, p.vec3, p.single
     Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
-    add_row, gather_pairs = rotne_prager.rows(single, threads).add_row, rotne_prager.rows(single, threads).gather_pairs
-    warp_sum = rotne_prager.over_warp(single)
-    within, between = pairs in ("within", "all"), pairs in ("between", "all")
+    row = rotne_prager.rows(single, flows.unequal, threads)
+    add_row, gather_pairs, warp_sum = row.add_row, row.gather_pairs, rotne_prager.over_warp(single)
+    within, between = flows.within, flows.between
     zero = wp.constant(single.real(0.0))
     symmetric, stored = form != "gathered", form == "stored"
-    module = p.module("flow_functions", f"{pairs}_{form}_{threads}")
+    module = p.module("flow_functions", f"{flows.variant}_{form}_{threads}")
 
     @wp.func(module=module)
     def load(flow: Flow, slot: wp.int32, f: vec3):
@@ -107,7 +110,7 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
                 first = model.first_node[model.first_flagellum[c]]
                 add_stored_row(flow, row_of(flow, first, c, i), i, begin, end)
             else:
-                add_row(flow.sum, i, begin, end, single.real(model.pairs.radius[c]))
+                add_row(flow.sum, i, begin, end, single.real(model.pairs.radius[model.first_flagellum[c]]))
 
     @wp.func(module=module)
     def spread(model: Model, flow: Flow, c: wp.int32, sources: wp.int32):
@@ -145,7 +148,7 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
             uz = flow.sum.uz[i]
         else:
             begin = model.first_node[model.first_flagellum[c]]
-            radius = single.real(model.pairs.radius[c])
+            radius = single.real(model.pairs.radius[model.first_flagellum[c]])
             u = single.vec3(zero)
             if wp.static(within and between):
                 u = gather_pairs(flow.sum, i, begin + thread, sources, radius)
@@ -172,10 +175,14 @@ def functions(p: Precision, pairs: str, form: str, threads: int = 1) -> SimpleNa
 
 
 @functools.cache
-def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
+def _kernels(p: Precision, touching: bool, flows: Flows, by_cells: bool) -> SimpleNamespace:
     real = p.single.real
     Model, State, Contacts, Flow = structs(p).Model, structs(p).State, contact_list.struct(p), struct(p)
-    row_of, module = rows(p), p.module("flow", "touching" if touching else "")
+    row_of = rows(p)
+    beads = body_flow.functions(p, p.single, by_cells)
+    axes_of, place, find = beads.axes_of, beads.place, beads.find
+    names = ["touching"] * touching + ["unequal"] * flows.unequal + ["body", *["cells"] * by_cells] * flows.body
+    module = p.module("flow", "_".join(names))
 
     @wp.func(module=module)
     def may_be_loaded(contacts_in: Contacts, e: wp.int32, end: wp.int32):
@@ -236,6 +243,8 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
             k += 1
         flow.start[own] = loaded
         flow.first_other[own] = unloaded
+        if wp.static(flows.body):
+            axes = axes_of(state, c)
         while e < end:
             slot = loaded
             if may_be_loaded(contacts_in, e, end):
@@ -249,9 +258,17 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
             flow.sum.x[slot] = real(x[0])
             flow.sum.y[slot] = real(x[1])
             flow.sum.z[slot] = real(x[2])
+            if wp.static(flows.unequal):
+                flow.sum.radius[slot] = real(model.pairs.radius[own])
+            if wp.static(flows.body):
+                place(state, flow.shell, e, axes)
+                if wp.static(by_cells):
+                    find(model, flow.shell, e, own, c)
             e += 1
 
-    @wp.func_native(native(__file__, "store_row", p.single, TENSOR=rotne_prager.tensor_code(p.single)))
+    tensor = rotne_prager.tensor_code(p.single, flows.unequal, "s.sum")
+
+    @wp.func_native(native(__file__, "store_row", p.single, TENSOR=tensor))
     def store_row(s: Flow, row: wp.int32, i: wp.int32, begin: wp.int32, a: wp.float32): ...
 
     @wp.kernel(module=module)
@@ -269,7 +286,7 @@ def _kernels(p: Precision, touching: bool) -> SimpleNamespace:
         end -= model.first_flagellum[c + 1] - model.first_flagellum[c]
         i = first
         while i < end and state.active[c] != 0:
-            store_row(flow, row_of(flow, first, c, i), i, first, real(model.pairs.radius[c]))
+            store_row(flow, row_of(flow, first, c, i), i, first, real(model.pairs.radius[model.first_flagellum[c]]))
             i += 1
 
     return SimpleNamespace(count=count, arrange=arrange, store=store)
@@ -291,6 +308,9 @@ def allocate(model: DeviceModel) -> Any:
     results = () if form == "gathered" else ("ux", "uy", "uz")
     for name in ("x", "y", "z", "fx", "fy", "fz", *results):
         setattr(flow.sum, name, zeros(model.element_count, wp.float32))
+    if model.switches.flows.unequal:
+        flow.sum.radius = zeros(model.element_count, wp.float32)
+    flow.shell = shell_stage.allocate(model, model.precision.single)
     if form == "stored":
         first_flagellum = model.data.first_flagellum.numpy()
         moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
@@ -303,7 +323,8 @@ def allocate(model: DeviceModel) -> Any:
 
 def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
     """Slots, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
-    kernels, device = _kernels(model.precision, contacts_in is not None), model.device
+    kernels = _kernels(model.precision, contacts_in is not None, model.switches.flows, model.plan.by_cells)
+    device = model.device
     listed = contact_list.struct(model.precision)() if contacts_in is None else contacts_in
     inputs = [model.data, state.data, listed, flow]
     wp.launch(kernels.count, model.flagellum_count, inputs=inputs, device=device)
@@ -313,13 +334,13 @@ def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = 
 
 
 @functools.cache
-def _velocity_kernel(p: Precision, pairs: str) -> Any:
+def _velocity_kernel(p: Precision, flows: Flows) -> Any:
     Model, State, Flow = structs(p).Model, structs(p).State, struct(p)
-    flows = functions(p, pairs, "stored")
+    sums = functions(p, flows, "stored")
     drag_velocity = node_velocity.local(p).drag_velocity
-    load, spread, flow_at, slots_end = flows.load, flows.spread, flows.flow_at, flows.slots_end
+    load, spread, flow_at, slots_end = sums.load, sums.spread, sums.flow_at, sums.slots_end
 
-    @wp.kernel(module=p.module("first_velocity", pairs))
+    @wp.kernel(module=p.module("first_velocity", flows.variant))
     def cells(
         # Model:
         model: Model,
@@ -357,10 +378,14 @@ def stores_pairs(model: DeviceModel) -> bool:
 
 
 def single_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
-    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces.
+    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces, and with flow round the body
+    its motion, found with the struct `Shell` of `flow`.
 
     Args:
         flow: the struct `StepFlow`, built for this pose; its forces are overwritten.
     """
-    kernel = _velocity_kernel(model.precision, model.switches.pairs)
+    flows = model.switches.flows
+    kernel = _velocity_kernel(model.precision, flows)
     wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)
+    if flows.body:
+        body_flow.carry(model, state, flow.shell, model.precision.single)

@@ -11,7 +11,7 @@ const float xi = X[i], yi = Y[i], zi = Z[i];
 for (int j = begin; j < i; ++j) {
     const float dx = xi - X[j], dy = yi - Y[j], dz = zi - Z[j];
     float c, d;
-    tensor(dx * dx + dy * dy + dz * dz, c, d);
+    tensor(dx * dx + dy * dy + dz * dz, j, c, d);
     const float along = wp::sqrt(d);
     C[j] = c;
     A[j] = along * dx; B[j] = along * dy; D[j] = along * dz;

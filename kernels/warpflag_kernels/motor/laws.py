@@ -128,7 +128,15 @@ def _functions(p: Precision) -> SimpleNamespace:
             total += state.flagellum_torque[k]
             k += 1
         no_force = vec3(zero)
-        _v, free = respond(model, state, c, no_force, total)
+        force = no_force
+        if state.surface_force.shape[0] > 0:
+            total += state.surface_torque[c]
+            force = state.surface_force[c]
+            k = begin
+            while k < end:
+                force += state.flagellum_force[k]
+                k += 1
+        _v, free = respond(model, state, c, force, total)
         spin = free
         iteration = int(0)
         while iteration <= most:

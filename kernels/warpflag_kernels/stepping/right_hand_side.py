@@ -11,11 +11,13 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import neighbours
-from warpflag_kernels.fluid import body, node_velocity, rotne_prager
+from warpflag_kernels.fluid import body, body_flow, node_velocity, rotne_prager
+from warpflag_kernels.fluid import shell as shell_stage
 from warpflag_kernels.rod import forces
 
 
@@ -64,15 +66,17 @@ def _evaluators(p: Precision, terms: tuple[Term, ...]) -> tuple[Any, Any]:
 
 
 @functools.cache
-def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: str, form: str) -> Any:
+def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: Flows, form: str) -> Any:
     Model, State = structs(p).Model, structs(p).State
-    PairSum, Neighbours = rotne_prager.struct(pair), neighbours.struct(p)
+    PairSum, Neighbours, Shell = rotne_prager.struct(pair), neighbours.struct(p), shell_stage.struct(pair)
     evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
     gather, motion = forces.functions(p, terms).gather, body.functions(p, terms)
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
-    move_cell = node_velocity.functions(p, pair, pairs, form).move_cell
-    name = "_".join([variant(terms), pairs, form, *["short"] * (pair != p)])
+    move_cell = node_velocity.functions(p, pair, flows, form).move_cell
+    beads = body_flow.functions(p, pair, stored=True)
+    obstruct, carry = beads.obstruct, beads.carry
+    name = "_".join([variant(terms), flows.variant, form, *["short"] * (pair != p)])
 
     @wp.kernel(module=p.module("whole_cell", name))
     def right_hand_side(
@@ -82,6 +86,7 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: s
         state: State,
         s: PairSum,
         near: Neighbours,
+        shell: Shell,
     ):
         c = wp.tid()
         if state.active[c] == 0:
@@ -96,10 +101,14 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], pairs: s
                 e += 1
             sum_flagellum(model, state, k)
             k += 1
+        if wp.static(flows.body):
+            obstruct(model, state, shell, c)
         if wp.static(settles):
             settle(model, state, c)
         move(model, state, c)
         move_cell(model, state, s, c)
+        if wp.static(flows.body):
+            carry(model, state, shell, c)
 
     return right_hand_side
 
@@ -112,6 +121,8 @@ def stages(model: DeviceModel) -> list[tuple[str, Callable[[DeviceModel, DeviceS
     pairs = "local drag"
     if model.switches.pairs != "none":
         pairs += f" and pair sum ({model.switches.pairs}{short})"
+    if model.switches.flows.body:
+        pairs += " and flow round the body"
     return [*listed, (pairs, node_velocity.node_velocities)]
 
 
@@ -119,8 +130,8 @@ def launch_right_hand_side(model: DeviceModel, state: DeviceState) -> None:
     """Forces, torques and velocities at the pose of `state`: a cell in one launch or stage by stage, as planned."""
     plan = model.plan
     if plan.by_cells:
-        kernel = _whole_cell(model.precision, plan.pair_precision, model.terms, model.switches.pairs, plan.pair_sum)
-        inputs = [model.data, state.data, state.pairs, state.neighbours]
+        kernel = _whole_cell(model.precision, plan.pair_precision, model.terms, model.switches.flows, plan.pair_sum)
+        inputs = [model.data, state.data, state.pairs, state.neighbours, state.shell]
         wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
         return
     for _name, launch in stages(model):
