@@ -213,6 +213,54 @@ def rotne_prager(x: np.ndarray, radius: float, viscosity: float) -> np.ndarray:
     return tensor.transpose(0, 2, 1, 3) / (math.pi * viscosity)
 
 
+def whole_mobility(scene: Scene, start: InitialState, points: np.ndarray, bead: float) -> np.ndarray:
+    """Mobility of the body (velocity, spin) and of nodes r_1..r_N with flow round it, shape [6 + 3 count] squared.
+
+    Mode all, a free body: beads and nodes have one Rotne-Prager mobility, and the loads on the beads are found with the
+    body's motion from the constraint that they move rigidly.
+
+    Args:
+        points: beads of the shell in body axes [um].
+        bead: their radius [um].
+    """
+    radius, eta = expected_pair_radius(scene), scene.fluid.viscosity
+    x = points @ matrix(start.body_orientation).T
+    y = np.concatenate([nodes[1:] for nodes in start.positions]) - start.body_position
+    n, count = 3 * len(x), 3 * len(y)
+    across = sphere_pairs(x, bead, y, radius, eta).reshape(n, count)
+    beads = sphere_pairs(x, bead, x, bead, eta).reshape(n, n)
+    turns = np.stack([np.cross(axis, x) for axis in np.eye(3)], axis=2).reshape(n, 3)
+    rigid = np.hstack([np.tile(np.eye(3), (len(x), 1)), turns])
+    # Loads l and motion U: beads l + across f = rigid U, rigid^T l = F.
+    system = np.block([[beads, -rigid], [rigid.T, np.zeros((6, 6))]])
+    right = np.zeros((n + 6, 6 + count))
+    right[n:, :6], right[:n, 6:] = np.eye(6), -across
+    solved = np.linalg.solve(system, right)
+    nodes = across.T @ solved[:n]
+    nodes[:, 6:] += dense_mobility(scene, start, radius)
+    return np.vstack([solved[n:], nodes])
+
+
+def sphere_pairs(x: np.ndarray, a: float, y: np.ndarray, b: float, eta: float) -> np.ndarray:
+    """Rotne-Prager tensors of spheres of radii a at x and b at y, none inside another, shape [len(x), 3, len(y), 3].
+
+    Apart: (1 + (a^2 + b^2)/6 nabla^2) of the Oseen tensor. Overlapping: Zuk et al., J. Fluid Mech. 741, R5 (2014).
+    """
+    d = x[:, None] - y[None]
+    r = np.linalg.norm(d, axis=-1)
+    r = np.where(r > 0, r, 1e-30)
+    e = d / r[..., None]
+    dyad = e[..., :, None] * e[..., None, :]
+    s, q = a * a + b * b, (a - b) ** 2
+    apart = ((1 + s / (3 * r**2)) / (8 * r), (1 - s / r**2) / (8 * r))
+    over = (
+        (16 * r**3 * (a + b) - (q + 3 * r**2) ** 2) / (32 * r**3) / (6 * a * b),
+        3 * (q - r**2) ** 2 / (32 * r**3) / (6 * a * b),
+    )
+    isotropic, along = (np.where(r > a + b, far, near)[..., None, None] for far, near in zip(apart, over, strict=True))
+    return (isotropic * np.eye(3) + along * dyad).transpose(0, 2, 1, 3) / (math.pi * eta)
+
+
 def dense_mobility(scene: Scene, start: InitialState, radius: float, drag: tuple | None = None) -> np.ndarray:
     """Mobility of nodes r_1..r_N of all flagella by the paper's law: local drag and the scene's pairs.
 
@@ -262,4 +310,31 @@ def device_mobility(sim: Simulation) -> np.ndarray:
             state.data.force.assign(force)
             node_velocity.node_velocities(model, state)
             columns.append(state.data.velocity.numpy()[nodes].astype(np.float64).ravel())
+    return np.stack(columns, axis=1)
+
+
+def device_whole_mobility(sim: Simulation) -> np.ndarray:
+    """The mobility of the body and of nodes r_1..r_N that the program's kernels apply, one column per unit force."""
+    from warpflag_kernels.fluid import body, node_velocity
+
+    sim.evaluate()
+    model, state = sim.system.model, sim.system.state
+    state.data.active.fill_(1)
+    nodes, columns = free_nodes(sim.scenes[0]), []
+    for column in range(6 + 3 * len(nodes)):
+        load, force = np.zeros(6), np.zeros((model.element_count, 3))
+        if column < 6:
+            load[column] = 1.0
+        else:
+            force[nodes[(column - 6) // 3], column % 3] = 1.0
+        on_body = np.zeros((2, model.flagellum_count, 3))
+        on_body[:, 0] = load.reshape(2, 3)
+        state.data.force.assign(force)
+        state.data.flagellum_force.assign(on_body[0])
+        state.data.flagellum_torque.assign(on_body[1])
+        body.move_bodies(model, state)
+        node_velocity.node_velocities(model, state)
+        moved = (state.data.body_velocity, state.data.body_spin, state.data.velocity)
+        u, w, v = (array.numpy().astype(np.float64) for array in moved)
+        columns.append(np.concatenate([u[0], w[0], v[nodes].ravel()]))
     return np.stack(columns, axis=1)

@@ -32,6 +32,8 @@ SWITCHES = {
     "hook": {"hook.stiffness": 0.65},
     "free": {"body.enabled": False, "flagella.count": 1},
     "motor law": {"motor.law": "torque_speed"},
+    "body flow": {"hydrodynamics.body_flow": True},
+    "unequal": {"hydrodynamics.mode": "consistent", "flagellum.0.segments": 10, "flagellum.1.segments": 20},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},
     "self": {"steric.self_contact": True},
 }
@@ -49,6 +51,9 @@ VARIANTS = [
     ("implicit", "self"),
     ("rkc", "motor law"),
     ("implicit", "motor law"),
+    ("rkc", "body flow"),
+    ("implicit", "body flow"),
+    ("implicit", "unequal"),
     ("implicit", "none"),
     ("implicit", "hook"),
     ("rkc", "free"),
@@ -111,6 +116,8 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "implicit", WARM, by_cells=True)
+    on_cpu |= launched(monkeypatch, precision, "implicit", SWITCHES["body flow"], by_cells=True)
+    on_cpu |= launched(monkeypatch, precision, "rkc", SWITCHES["body flow"], by_cells=True)
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}
     assert used == kernels_in_source()  # no file is forgotten, and no kernel lies idle
     # To keep this short, what a variant compiles anew meets one architecture per precision, and both in all.

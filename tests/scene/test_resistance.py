@@ -14,7 +14,6 @@ import pytest
 from tests.helpers import attachment, cell, ground_state_frames, helix_axis, placed
 from tests.oracles import device_mobility
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, SceneError, with_values
 from warpflag.scene.resistance import spheroid_mobility
 
 # Relative to resistive-force theory and to the numbers quoted below, which have three or four digits.
@@ -147,16 +146,3 @@ def test_consistent_mode_converges_to_slender_body_theory(device):
         for count in (45, 180)
     ]
     assert printed[1] < 0.9 * printed[0]
-
-
-@pytest.mark.parametrize("segments", [60, 75, 100, 200])
-def test_mixed_segments_are_refused_where_the_consistent_mobility_would_be_indefinite(segments):
-    """The pair radius of the longest segments can be too much for the shortest."""
-    values = {"hydrodynamics.mode": "consistent", "flagellum.0.segments": 12, "flagellum.1.segments": segments}
-    scene = with_values(Scene(name="mixed"), values)
-    try:
-        mobility = device_mobility(Simulation(scene, device="cpu"))
-    except SceneError as error:
-        assert segments > 60 and error.key == "flagella.segment_length"
-    else:
-        assert segments < 200 and np.linalg.eigvalsh(mobility).min() > 0.0
