@@ -203,6 +203,8 @@ class Scene(Section, key=""):
                 f"has no noise: that mobility is not positive definite; {key} needs none, within, all or consistent"
             )
             raise SceneError("hydrodynamics.mode", mode, problem, related)
+        if self.hydrodynamics.body_flow:
+            raise SceneError("hydrodynamics.body_flow", True, f"takes no {key} yet", related)
         if numerics.stepper == "rkc":
             raise SceneError("numerics.stepper", "rkc", f"takes no {key}; implicit and euler do", related)
         if numerics.accuracy is not None:

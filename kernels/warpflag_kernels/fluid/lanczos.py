@@ -258,10 +258,10 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
         here = n * count
         begin_node = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
-        own = self_mobility(model, c)
         alpha = wp.float64(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
+            own = self_mobility(model, c, k)
             e = model.first_node[k]
             z.basis[here + count + e] = vec3(real(0.0))
             if wp.static(free):

@@ -67,10 +67,10 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
     module = p.module("noise_functions", "pairs" if pairs else "")
 
     @wp.func(module=module)
-    def self_mobility(model: Model, c: wp.int32):
-        """1/(6 pi eta a), the self term of the pair sum [um/(s pN)]; zero without one."""
+    def self_mobility(model: Model, c: wp.int32, k: wp.int32):
+        """1/(6 pi eta a), the self term of the pair sum on flagellum k of cell c [um/(s pN)]; zero without one."""
         if wp.static(pairs):
-            return four_thirds * model.pairs.mobility[c] / model.pairs.radius[c]
+            return four_thirds * model.pairs.mobility[c] / model.pairs.radius[k]
         return real(0.0)
 
     @wp.func(module=module)
@@ -84,7 +84,7 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
     @wp.func(module=module)
     def excess_root(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32, xi: vec3):
         """S^1/2 xi at node e, not r_0 [(um/(s pN))^1/2]."""
-        own = self_mobility(model, c)
+        own = self_mobility(model, c, k)
         t = node_tangent(model, state, e, k)
         # Across, the excess may be zero by the choice of the pair radius, and round-off of either sign.
         along = wp.sqrt(wp.max(model.drag.mobility_along[e] - own, real(0.0)))
@@ -187,8 +187,9 @@ def _kernels(p: Precision, pairs: bool, free: bool) -> SimpleNamespace:
             first = model.first_node[model.first_flagellum[c]]
             axis = state.pose.tangent[first + 1]
             v = (real(noise.energy[c]) * two * (across - along) / state.pose.length[first + 1]) * axis
-            along = wp.max(along - self_mobility(model, c), zero)
-            across = wp.max(across - self_mobility(model, c), zero)
+            own = self_mobility(model, c, model.first_flagellum[c])
+            along = wp.max(along - own, zero)
+            across = wp.max(across - own, zero)
         u = v + scale * root(axis, along, across, vec3(a[0], a[1], a[2]))
         w = scale * root(axis, body.spin_mobility[c], body.tumble_mobility[c], vec3(b[0], b[1], b[2]))
         noise.body[c] = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
