@@ -389,8 +389,7 @@ def obstruct(model: DeviceModel, state: DeviceState, shell: Any, pair: Precision
 
 
 def carry(model: DeviceModel, state: DeviceState, shell: Any, pair: Precision) -> None:
-    """Adds what the loads on the moving bodies do to the velocities of nodes; after `obstruct`, whose arguments it has,
-    and the bodies' motion."""
+    """Adds what the loads on the moving bodies do to the velocities of nodes; after `obstruct` and their motion."""
     data, cells, device = model.data, model.cell_count, model.device
     if model.plan.by_cells:
         kernel = _cell_kernels(model.precision, pair, False).carry_cells

@@ -18,7 +18,6 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body as body_stage
@@ -66,7 +65,7 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     f, fd = rotations.functions(p), rotations.functions(p.double)
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
-    respond = body_stage.mobility(p, Flows("none")).respond
+    respond = body_stage.mobility(p).respond
     module = p.module("additive_chart", "free" if free else "")
 
     @wp.kernel(module=module)
