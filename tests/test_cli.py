@@ -223,7 +223,9 @@ def test_a_run_says_where_it_wrote_and_nothing_of_warp(scene):
     ended = command("run", scene)
     assert ended.returncode == 0
     assert ended.stdout.count("\n") == 1 and ended.stdout.endswith(f"{Path('runs', 'small')}\n")
-    assert all(line.endswith("ms per ms") or "compiling" in line for line in ended.stderr.splitlines()), ended.stderr
+    assert all(line.endswith("per simulated ms") or "compiling" in line for line in ended.stderr.splitlines()), (
+        ended.stderr
+    )
     quiet = command("run", scene, "--quiet")
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
 

@@ -23,7 +23,7 @@ class Clock:
 
 
 def run(stream, clock, *, total=0.015, start=0.0, updates=150, seconds_per_update=0.06, quiet=False):
-    """A run that takes 9 s for 15 ms: 600 ms per ms."""
+    """A run that takes 9 s for 15 ms: 600 ms for each."""
     progress = Progress(total, stream, quiet, clock)
     progress.update(start)
     for i in range(1, updates + 1):
@@ -55,7 +55,9 @@ def test_speed_and_time_left():
     stream, clock = io.StringIO(), Clock()
     run(stream, clock, updates=51, seconds_per_update=6.0)
     line = stream.getvalue().splitlines()[-1]
-    assert "33 %" in line and "5.00 / 15.00 ms" in line and "60000 ms per ms" in line and "10:00 min left" in line
+    assert (
+        "33 %" in line and "5.00 / 15.00 ms" in line and "60.0 s per simulated ms" in line and "10:00 min left" in line
+    )
 
 
 def test_first_moments_tell_nothing_of_the_rate():
@@ -65,14 +67,15 @@ def test_first_moments_tell_nothing_of_the_rate():
     for seconds, time in ((1.0, 1e-5), (1.5, 1e-4)):  # under two seconds and one per cent: no word yet
         clock.now = Clock.now + seconds
         progress.update(time)
-        assert "per ms" not in stream.getvalue() and "left" not in stream.getvalue()
+        assert "per simulated ms" not in stream.getvalue() and "left" not in stream.getvalue()
     clock.now = Clock.now + 2.5
     progress.update(1.2e-4)
-    assert "per ms" in stream.getvalue() and "left" in stream.getvalue()
+    assert "per simulated ms" in stream.getvalue() and "left" in stream.getvalue()
 
 
 @pytest.mark.parametrize(
-    ("seconds_per_update", "expected"), [(2.0, "3:20 min left"), (60.0, "1:40 h left"), (0.001, "10.0 ms per ms")]
+    ("seconds_per_update", "expected"),
+    [(2.0, "3:20 min left"), (60.0, "1:40 h left"), (0.001, "10.0 ms per simulated ms")],
 )
 def test_time_left_reads_well(seconds_per_update, expected):
     stream = io.StringIO()
@@ -87,18 +90,28 @@ def test_a_terminal_gets_one_line_redrawn():
     assert text.count("\n") == 1 and text.endswith("\n")
     drawn = text[:-1].split("\r")[1:]
     assert 60 < len(drawn) < 100  # ten a second at most
-    assert drawn[0].startswith("[................]   0 %")
-    assert drawn[-1].startswith("[################] 100 %")
-    assert max(map(len, drawn)) < 80
+    assert drawn[0].startswith("[..........]   0 %")
+    assert drawn[-1].startswith("[##########] 100 %")
+    assert max(map(len, drawn)) < 80 and "600 ms per simulated ms" in drawn[-1]
     # What a shorter line leaves of a longer one before it is blanked.
     assert all(len(after) >= len(before.rstrip()) for before, after in pairwise(drawn))
+
+
+@pytest.mark.parametrize("columns", [30, 50, 70])
+def test_a_narrow_terminal_gets_a_line_that_fits(columns, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    stream = Screen()
+    run(stream, Clock(), updates=75).close()
+    drawn = [line.rstrip() for line in stream.getvalue()[:-1].split("\r")[1:]]
+    assert max(map(len, drawn)) < columns and " 50 %  7.50 / 15.00 ms" in drawn[-1]
+    assert ("left" in drawn[-1]) == (columns > 30)
 
 
 def test_a_resumed_run_counts_its_own_speed():
     stream = io.StringIO()
     run(stream, Clock(), start=0.009, updates=75).close()
     line = stream.getvalue().splitlines()[-1]
-    assert "80 %" in line and "1500 ms per ms" in line and "4 s left" in line  # 3 ms in 4.5 s, 3 ms to go
+    assert "80 %" in line and "1.5 s per simulated ms" in line and "4 s left" in line  # 3 ms in 4.5 s, 3 ms to go
 
 
 def test_quiet_and_unused_are_silent():

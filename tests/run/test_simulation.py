@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -128,17 +130,32 @@ class Listener:
         self.heard.append("close")
 
 
-def test_reporters_take_the_frames_of_one_run(tmp_path):
+def test_reporters_take_the_frames_of_a_run_and_of_what_follows(tmp_path):
     listener = Listener()
     simulation = Simulation(small(), device="cpu", reporters=[listener, Recorder(tmp_path / "run.h5")])
     simulation.run(4.5e-5)
     assert listener.heard == ["start", *["write"] * 5, "close"]
     assert simulation.state.time == pytest.approx(4.5e-5) and listener.frames[-1].time == pytest.approx(4e-5)
     simulation.run()
-    assert simulation.state.time == small().duration and len(listener.frames) == 5
+    times = small().duration / small().frames * np.arange(small().frames + 1)
+    assert simulation.state.time == small().duration
+    assert [frame.time for frame in listener.frames] == pytest.approx(times)  # none is left out, none comes twice
+    assert listener.heard[5:] == ["write", "close", "start", *["write"] * (len(times) - 5), "close"]
     with Record(tmp_path / "run.h5") as record:
-        assert record.frame_count == 5
+        assert record.times == pytest.approx(times)
         np.testing.assert_array_equal(record.positions[-1], listener.frames[-1].positions)
+
+
+def test_a_run_shows_a_bar_on_a_terminal_and_is_quiet_in_a_log(monkeypatch, capfd):
+    pytest.importorskip("tqdm")
+    simulation = Simulation(small(), device="cpu")
+    simulation.run(4e-5, progress=True)
+    assert capfd.readouterr().err == ""
+    screen = io.StringIO()
+    screen.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stderr", screen)
+    simulation.run(progress=True)
+    assert "100%" in screen.getvalue() and "ms" in screen.getvalue()
 
 
 def test_reporters_are_closed_when_a_guard_is_violated():

@@ -76,6 +76,8 @@ def find_device(name: Any = None) -> Any:
     """
     wp = start_warp()
     try:
+        if str(name).startswith("cuda") and not wp.is_cuda_available():
+            raise ValueError("no CUDA driver, or no device")  # Warp's own look would print its errors
         return wp.get_device(name)
     except Exception as error:
         aliases = ", ".join(device.alias for device in wp.get_devices())

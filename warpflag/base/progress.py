@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from time import monotonic
 from typing import TextIO
 
 from warpflag.base.streams import is_terminal, say
 
-__all__ = ["Progress"]
+__all__ = ["Progress", "watching"]
 
-_BAR_CELLS = 16
+_BAR_CELLS = 10
+_NARROWEST = 30  # columns: percentage and times stand in any case
 _TERMINAL_INTERVAL = 0.1
 _LOG_INTERVAL = 60.0
 _LOG_SHARE = 0.01
@@ -92,22 +95,35 @@ class Progress:
         assert self._start is not None and self._time is not None
         fraction = min(1.0, self._time / self._total) if self._total > 0.0 else 1.0
         line = f"{100.0 * fraction:3.0f} %  {1e3 * self._time:.2f} / {1e3 * self._total:.2f} ms"
-        if self._terminal:
-            filled = int(_BAR_CELLS * fraction)
-            line = f"[{'#' * filled}{'.' * (_BAR_CELLS - filled)}] {line}"
+        filled = int(_BAR_CELLS * fraction)
+        bar = f"[{'#' * filled}{'.' * (_BAR_CELLS - filled)}] " if self._terminal else ""
         simulated = self._time - self._start[1]
         elapsed = now - self._start[0]
         known = elapsed > _SECONDS_BEFORE_SPEED or simulated >= _SHARE_BEFORE_SPEED * self._total
         if simulated > 0.0 and known:
             cost = elapsed / simulated
-            line += f"  {cost:.{0 if cost >= 100.0 else 1}f} ms per ms"
-            if self._time < self._total:
-                line += f"  {_duration(cost * (self._total - self._time))} left"
-        return line
+            speed = f"  {_cost(cost)} per simulated ms"
+            left = f"  {_duration(cost * (self._total - self._time))} left" if self._time < self._total else ""
+            return next(x for x in (bar + line + speed + left, bar + line + left, line + left, line) if self._fits(x))
+        return bar + line if self._fits(bar + line) else line
+
+    def _fits(self, line: str) -> bool:
+        """Whether the terminal is wide enough for a line; the last choice is taken in any case."""
+        return not self._terminal or len(line) < shutil.get_terminal_size().columns or len(line) < _NARROWEST
 
     def _write(self, text: str) -> None:
         if not say(text, self._stream):
             self._quiet = True
+
+
+def _cost(cost: float) -> str:
+    """Computing time of a simulated ms: 2.1 ms, 130 ms, 1.5 s.
+
+    Args:
+        cost: in seconds per simulated second.
+    """
+    value, unit = (cost, "ms") if cost < 1000.0 else (cost / 1000.0, "s")
+    return f"{value:.{0 if value >= 100.0 else 1}f} {unit}"
 
 
 def _duration(seconds: float) -> str:
@@ -118,3 +134,37 @@ def _duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60}:{whole % 60:02d} min"
     return f"{whole // 3600}:{whole % 3600 // 60:02d} h"
+
+
+@contextmanager
+def watching(shown: bool, time: Callable[[], float], end: float) -> Iterator[Callable[[], None] | None]:
+    """A bar of tqdm, in a notebook or on a terminal; nothing is written to a log.
+
+    Args:
+        shown: whether there is one.
+        time: gives the simulated time reached [s].
+        end: simulated time to reach [s].
+
+    Returns:
+        What is to be called now and then; None without a bar.
+
+    Raises:
+        ModuleNotFoundError: tqdm is not installed.
+    """
+    if not shown:
+        yield None
+        return
+    try:
+        from tqdm.auto import tqdm
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("progress=True needs tqdm: pip install 'warpflag[notebook]'", name="tqdm") from error
+    in_notebook = any(kind.__module__ == "tqdm.notebook" for kind in tqdm.__mro__)
+    begin = time()
+    # disable=None: shown on a terminal only.
+    with tqdm(total=round(1e3 * (end - begin), 6), unit="ms", disable=False if in_notebook else None) as bar:
+
+        def watch() -> None:
+            bar.update(round(1e3 * (time() - begin) - bar.n, 6))
+
+        yield watch
+        watch()

@@ -41,7 +41,7 @@ _BLOCK_SECONDS = 2.0
 
 
 class Recorder:
-    """Reporter that writes run.h5: start, write frame by frame, flush, close.
+    """Reporter that writes run.h5: start, write frame by frame, flush, close. Started again, it goes on with its file.
 
     Frames are committed in blocks, or once 2 s have passed since the last block; the first frame at once. After an
     exception (Ctrl-C) close() commits what is pending.
@@ -78,6 +78,7 @@ class Recorder:
         self._committed = 0
         self._pending: list[dict[str, Any]] = []
         self._last_commit = float("-inf")  # so that the first frame is late
+        self._last_step = resume_step
 
     @property
     def frame_count(self) -> int:
@@ -131,6 +132,7 @@ class Recorder:
             DiskError: a block of frames could not be written; all committed before stay readable.
         """
         values = values_of(frame)
+        self._last_step = frame.step
         if not self._started:
             self._create(values)
             return
@@ -169,6 +171,8 @@ class Recorder:
         try:
             self.flush()
         finally:
+            if self._started:
+                self._resume_step = self._last_step  # started once more, it goes on
             self._started = False
             self._release()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from warpflag import __version__
 from warpflag.record import Frame
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Reporter", "start_reporter", "versions"]
+__all__ = ["Reporter", "hand_over", "start_reporter", "versions"]
 
 
 class Reporter(Protocol):
@@ -69,6 +69,28 @@ def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> 
         body_width=width,
         versions=versions(),
     )
+
+
+def hand_over(reporters: Sequence[Reporter], scene: Scene, first_node: np.ndarray, frames: Iterable[Frame]) -> None:
+    """Starts reporters, hands them the frames of a run as they are made, and closes them, also after an error.
+
+    Args:
+        reporters: of the run.
+        scene: what is run.
+        first_node: as in `start_reporter`.
+        frames: of the run.
+    """
+    started: list[Reporter] = []
+    try:
+        for reporter in reporters:
+            started.append(reporter)
+            start_reporter(reporter, scene, first_node)
+        for frame in frames:
+            for reporter in started:
+                reporter.write(frame)
+    finally:
+        for reporter in started:
+            reporter.close()
 
 
 def versions() -> dict[str, str]:

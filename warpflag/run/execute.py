@@ -120,7 +120,7 @@ class Run:
             self._end(ended)
 
     def _prepare(self, quiet: bool, stop: Stop) -> None:
-        said = "warpflag: compiling kernels, once on each machine\n"
+        said = "warpflag: compiling kernels, once for each kind of scene on a machine; they are kept\n"
         timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, sys.stderr.write, [said])
         if not quiet:
             timer.start()

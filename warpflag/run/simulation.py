@@ -16,13 +16,14 @@ from warpflag_kernels.stepping import evaluation_time, health
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.base.device import LAUNCHING, alone, find_device
+from warpflag.base.progress import watching
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import check_outside
 from warpflag.model.starts import starting_states
 from warpflag.record import Frame
 from warpflag.record.cell_state import CellState, Evaluation
-from warpflag.record.reporters import Reporter, start_reporter
+from warpflag.record.reporters import Reporter, hand_over
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames
@@ -113,10 +114,15 @@ class Simulation:
         """The first cell on the host, at the time it has reached."""
         return self.cell_state()
 
-    def run(self, duration: float | None = None) -> None:
+    def run(self, duration: float | None = None, *, progress: bool = False) -> None:
         """Advances by a simulated time [s], by default to the end of the scene, and hands frames to the reporters.
 
-        Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state.
+        Frames fall on the multiples of the scene's duration / frames; the first run begins with the present state. A
+        further run goes on recording: reporters are started again and get the frames that follow.
+
+        Args:
+            duration: by which to advance [s].
+            progress: shows a bar, in a notebook or on a terminal; needs tqdm, the extra `notebook`.
 
         Raises:
             NumericalError: a guard was violated.
@@ -125,17 +131,10 @@ class Simulation:
         if duration is not None and not 0.0 <= duration < float("inf"):
             raise ValueError(f"a run takes a time from 0 on, not {duration}")
         until = self.scenes[0].duration if duration is None else float(self.times[0]) + duration
-        reporters, self.reporters = self.reporters, []
-        try:
-            for reporter in reporters:
-                start_reporter(reporter, self.scenes[0], self.first_node)
-            for frame in self.frames(until) if reporters else ():
-                for reporter in reporters:
-                    reporter.write(frame)
-        finally:
-            for reporter in reporters:
-                reporter.close()
-        self.advance(until)
+        with watching(progress, lambda: float(self.times.min()), until) as watch:
+            frames = self.frames(until, watch) if self.reporters else ()
+            hand_over(self.reporters, self.scenes[0], self.first_node, frames)
+            self.advance(until, watch)
 
     def frames(self, until: float, watch: Callable[[], None] | None = None) -> Iterator[Frame]:
         """Advances one scene to a time and yields a frame at each multiple of its duration / frames on the way.

@@ -1,7 +1,7 @@
 """What a cell is: settings and their sections, the scene and its file, resistance coefficients."""
 
 from warpflag.scene.errors import SceneError
-from warpflag.scene.reading import dumps, load, loads, with_values
+from warpflag.scene.reading import dumps, flagellum_example, load, loads, with_values
 from warpflag.scene.scene import FlagellumSpec, Scene
 from warpflag.scene.sections import Body, Flagella, FlagellumOverride, Motor
 
@@ -14,6 +14,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "dumps",
+    "flagellum_example",
     "load",
     "loads",
     "with_values",

@@ -102,6 +102,13 @@ def dumps(scene: Scene) -> str:
     return "\n".join(lines) + "\n"
 
 
+def flagellum_example() -> str:
+    """All keys of a [[flagellum]] table as comments, for a scene that has none."""
+    lines = scene_file.section_lines(FlagellumOverride())
+    head = "# One table for each flagellum, or none; --set flagellum.0.torque=1.5 sets a value of a single one."
+    return "\n".join([head, "# [[flagellum]]", *lines]) + "\n"
+
+
 def _built(values: Mapping[str, Any], tables: int) -> Scene:
     """A scene of values by dotted key, of which `tables` overrides of flagella exist already."""
     problems = Problems()

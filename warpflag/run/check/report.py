@@ -12,7 +12,7 @@ from warpflag.run.check.noise import of_noise
 from warpflag.run.check.rigid import turning
 from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, dumps
+from warpflag.scene import Scene, dumps, flagellum_example
 
 __all__ = ["report"]
 
@@ -51,8 +51,10 @@ def report(scene: Scene, device: str | None = None) -> str:
         *of_noise(scene, longest),
     ]
     without = left_out(scene, turning(scene))
+    own = "" if scene.flagellum else "\n" + flagellum_example()
     return (
         dumps(scene)
+        + own
         + "\n# What it requires\n"
         + "".join(f"# {line}\n" for line in lines)
         + "\n# What it leaves out, and how large that would be (docs/tradeoff.md)\n"
