@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from warpflag import __version__, sweep_command, tradeoff_command
+from warpflag.base.output import machine_error
 from warpflag.base.streams import protected_streams
 
 if TYPE_CHECKING:
@@ -46,22 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except _bad_input() as error:  # after the interrupt, which may have come while these were being imported
         return _say(_located(error, options), BAD_INPUT)
     except OSError as error:
-        return _say(_machine_error(error), FAILED)
+        return _say(machine_error(error), FAILED)
 
 
 def _say(message: object, status: int) -> int:
     print("\n".join(f"warpflag: {line}" for line in str(message).splitlines()), file=sys.stderr)
     return status
-
-
-def _machine_error(error: OSError) -> str:
-    """What the machine refused, in one line."""
-    if not error.filename:
-        return str(error)
-    cache = getattr(getattr(sys.modules.get("warp"), "config", None), "kernel_cache_dir", None)
-    kept = bool(cache) and os.path.realpath(os.fsdecode(error.filename)).startswith(os.path.realpath(str(cache)))
-    advice = "; kernels are kept there: let WARP_CACHE_PATH name a folder that can be written" if kept else ""
-    return f"{error.filename}: {error.strerror}{advice}"
 
 
 def _bad_input() -> tuple[type[Exception], ...]:
@@ -116,14 +107,8 @@ def _parser() -> argparse.ArgumentParser:
     for command in (run, check):
         command.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
         command.add_argument("--precision", choices=("float64", "float32"), help="as --set numerics.precision=...")
-        command.add_argument(
-            "--set",
-            nargs="+",
-            action="extend",
-            default=[],
-            metavar="KEY=VALUE",
-            help="replace values: motor.torque=2, flagellum.0.torque=1.5, ... (check lists all keys)",
-        )
+        said = "replace values: motor.torque=2 flagellum.0.torque=1.5 (check lists all keys)"
+        command.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=said)
 
     plot = commands.add_parser(
         "plot",
@@ -219,8 +204,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.scene is None and options.set and "=" not in options.set[-1]:
         options.scene = options.set.pop()  # run --set key=value SCENE.toml
     if options.scene is not None and os.path.isdir(options.scene):
-        going_on = f"to go on with the run in it: warpflag run --resume {options.scene}"
-        return _say(f"{options.scene} is a directory, not a SCENE.toml; {going_on}", BAD_INPUT)
+        return _say(
+            f"{options.scene} is no SCENE.toml; to go on there: warpflag run --resume {options.scene}", BAD_INPUT
+        )
     if (options.scene is None) == (options.resume is None):
         return _say("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
     if options.resume is not None and (options.output or options.precision):

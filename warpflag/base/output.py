@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["DiskError", "OutputError", "whole"]
+__all__ = ["DiskError", "OutputError", "machine_error", "whole"]
 
 
 class OutputError(ValueError):
@@ -53,3 +54,13 @@ def whole(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def machine_error(error: OSError) -> str:
+    """What the machine refused, in one line."""
+    if not error.filename:
+        return str(error)
+    cache = getattr(getattr(sys.modules.get("warp"), "config", None), "kernel_cache_dir", None)
+    kept = bool(cache) and os.path.realpath(os.fsdecode(error.filename)).startswith(os.path.realpath(str(cache)))
+    advice = "; kernels are kept there: let WARP_CACHE_PATH name a folder that can be written" if kept else ""
+    return f"{error.filename}: {error.strerror}{advice}"
