@@ -12,7 +12,7 @@ import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
 import pytest
 
-from tests.attack.damage import damaged
+from examples.reliability.damage import damaged
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.record import Record, RecordError
 from warpflag.record.layout import checksum

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.attack.scenes import malformed
+from examples.reliability.malformed import malformed
 from warpflag.scene import FlagellumOverride, Motor, Scene, SceneError, dumps, load, loads, with_values
 
 

@@ -1,0 +1,93 @@
+"""What an attack finds: outcomes of single attempts, and the command line that most of them drive."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warpflag.record import Record
+
+OUTCOMES = ("right", "refused", "stopped", "wrong", "lost", "traceback")
+"""right: the numbers of an undisturbed or a finer run. refused: one line and status 2, or 1 where the machine failed.
+stopped: by a guard, one line and status 3. wrong: other numbers, or an end that says nothing. lost: what was committed
+can't be read, or a run can't go on. traceback: more than the lines that a user should see, a crash, or no end."""
+ROOT = Path(__file__).parent.parent.parent
+PATIENCE = 120.0
+"""Wall time after which a command is taken to hang [s]."""
+
+
+_PROGRESS = re.compile(r"\s*\d+ %|.*compiling kernels")
+
+
+@dataclass(frozen=True)
+class Found:
+    """The outcome of one attempt.
+
+    Attributes:
+        outcome: one of `OUTCOMES`.
+        note: what was done and what came of it, in a line.
+        numbers: of the attempt, for tables.
+    """
+
+    outcome: str
+    note: str
+    numbers: dict[str, Any]
+
+
+def found(outcome: str, note: str, **numbers: Any) -> Found:
+    """An outcome with its note in one line."""
+    return Found(outcome, " ".join(note.split())[:300], numbers)
+
+
+def command(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """The command `warpflag` in a process of its own, from the checkout."""
+    options.setdefault("timeout", PATIENCE)
+    own = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "kernels")])}
+    env = {**os.environ, **own, **options.pop("env", {})}
+    line = [sys.executable, "-m", "warpflag", *arguments]
+    return subprocess.run(line, capture_output=True, text=True, errors="replace", env=env, **options)
+
+
+def problem(ended: subprocess.CompletedProcess[str]) -> str:
+    """What is wrong with how a command ended, whatever its status; empty where nothing is."""
+    if ended.returncode < 0:
+        return f"died of {signal.Signals(-ended.returncode).name}"
+    if "Traceback" in ended.stderr or "Error:" in ended.stderr.split("warpflag:")[0]:
+        return f"traceback: {ended.stderr.strip().splitlines()[-1]}"
+    if ended.returncode not in (0, 1, 2, 3, 130, 143):
+        return f"status {ended.returncode}"
+    if ended.returncode in (1, 2) and len(told(ended)) != 1:
+        return f"status {ended.returncode} with {len(told(ended))} lines: {ended.stderr[-200:]}"
+    return ""
+
+
+def told(ended: subprocess.CompletedProcess[str]) -> list[str]:
+    """Lines on standard error that are no progress."""
+    lines = ended.stderr.replace("\r", "\n").splitlines()
+    return [line for line in lines if line.strip() and not _PROGRESS.match(line)]
+
+
+def frames_of(directory: Path) -> dict[str, np.ndarray]:
+    """Everything that a record holds of its frames."""
+    with Record(directory) as record:
+        names = ("times", "steps", "positions", "directors", "motor_angle", "body_position", "body_orientation")
+        return {name: np.asarray(getattr(record, name)[:]) for name in names} | record.observables
+
+
+def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    """Whether all frames agree to the last bit."""
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
+
+
+def leading(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    """Whether the frames of a are the first frames of b, to the last bit."""
+    count = len(a["times"])
+    return same(a, {name: values[:count] for name, values in b.items()})

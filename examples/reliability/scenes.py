@@ -1,0 +1,208 @@
+"""Attacks on scenes: malformed files, and random valid scenes each against a finer run."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from examples.reliability.attempt import Found, found
+from examples.reliability.malformed import malformed
+from warpflag.model.geometry import InitialState
+from warpflag.run.simulation import NumericalError, Simulation
+from warpflag.scene import Scene, SceneError, load, with_values
+from warpflag.stepping.stepper import DEFAULT_ACCURACY
+
+FINER = 30.0
+"""Accuracy over that of the finer run."""
+CUT_OFF = 60.0
+"""Computing time of a finer run [s]."""
+LOOKS = 10
+"""Times at which two runs are compared."""
+BEYOND = 10.0
+"""Error over what was asked from which a run is wrong."""
+PARTING = 100.0
+"""Growth of a disturbance from which the motion counts as unstable."""
+
+
+def malformed_scene(seed: int, folder: Path) -> Found:
+    """A malformed scene file is refused in lines of one problem each, within seconds; a sound one is read."""
+    path = folder / "scene.toml"
+    path.write_bytes(malformed(seed))
+    begin = time.monotonic()
+    try:
+        load(path)
+    except SceneError as error:
+        if any(not line.strip() for line in str(error).splitlines()) or time.monotonic() - begin > 5.0:
+            return found("wrong", f"{time.monotonic() - begin:.1f} s: {error}")
+        return found("refused", str(error))
+    except Exception as error:
+        return found("traceback", f"{type(error).__name__}: {error}")
+    return found("right", "is sound")
+
+
+def random_values(seed: int) -> dict[str, Any]:
+    """Values of a valid scene, by key: each one is left at its default or drawn from what the schema allows."""
+    chance = random.Random(f"scene {seed}")
+    count = chance.choice([1, 2, 2, 2, 3, 4, 6])
+
+    def maybe(share: float, value: Any) -> Any:
+        return value if chance.random() < share else None
+
+    def spread(usual: float, factor: float) -> float:
+        return usual * factor ** chance.uniform(-1, 1)
+
+    drawn: dict[str, Any] = {
+        "flagella.count": count,
+        "flagella.phase_difference": None,
+        "flagella.segment_length": chance.choice([0.1, 0.2, 0.2, 0.25]),
+        "flagella.opening_angle": chance.uniform(10, 150),
+        "flagella.bending_rigidity": maybe(0.4, spread(3.5, 10)),
+        "flagella.twist_rigidity": maybe(0.4, spread(3.5, 10)),
+        "flagella.stretching_stiffness": maybe(0.3, spread(3e3, 10)),
+        "fluid.viscosity": maybe(0.4, spread(1e-3, 10)),
+        "motor.torque": maybe(0.7, spread(1.5, 4)),
+        "motor.axis_angle": maybe(0.3, chance.uniform(20, 90)),
+        "motor.bearing_torque": maybe(0.2, True),
+        "steric.strength": maybe(0.3, spread(0.8, 5)),
+        "body.length": maybe(0.4, chance.uniform(1.5, 4.0)),
+        "body.width": maybe(0.4, chance.uniform(0.6, 1.2)),
+        "body.contact": maybe(0.2, False),
+        "body.anchored": maybe(0.2, True),
+        "hydrodynamics.mode": maybe(0.6, chance.choice(["none", "within", "all", "consistent"])),
+        "numerics.stepper": maybe(0.2, "rkc"),
+        "numerics.precision": maybe(0.2, "float32"),
+        "external.body_force": maybe(0.1, (0.0, chance.uniform(-2, 2), 1.0)),
+        "duration": 10 ** chance.uniform(-4, -3),
+        "frames": 10,
+    }
+    for k in range(count if chance.random() < 0.5 else 0):
+        drawn |= {
+            f"flagellum.{k}.length": chance.uniform(2.0, 6.0),
+            f"flagellum.{k}.torque": chance.choice([-1, 1]) * spread(1.5, 4),
+            f"flagellum.{k}.phase": chance.uniform(-180, 180),
+            f"flagellum.{k}.azimuth": 360.0 * (k + chance.uniform(-0.3, 0.3)) / count,
+        }
+    return {key: value for key, value in drawn.items() if value is not None or key == "flagella.phase_difference"}
+
+
+def looks(
+    scene: Scene, start: InitialState | None, cut_off: float
+) -> tuple[list[np.ndarray], float, str, Simulation | None]:
+    """Node positions at equal times to the end of a scene, as far as it comes; computing time [s]; how it ended."""
+    seen: list[np.ndarray] = []
+    begin = time.process_time()
+
+    class Late(Exception):
+        pass
+
+    def watch() -> None:
+        if time.process_time() - begin > cut_off:
+            raise Late
+
+    sim = None
+    try:
+        sim = Simulation(scene, device="cpu", starts=start)
+        sim.prepare()
+        begin = time.process_time()
+        for k in range(LOOKS):
+            sim.advance(scene.duration * (k + 1) / LOOKS, watch)
+            seen.append(sim.cell_state().positions)
+    except NumericalError as error:
+        return seen, time.process_time() - begin, str(error), sim
+    except Late:
+        return seen, time.process_time() - begin, "cut off", sim
+    return seen, time.process_time() - begin, "", sim
+
+
+def asked(scene: Scene, time: float) -> float:
+    """Node error that a scene's accuracy allows after a time [um]: in proportion to it, or of independent errors."""
+    share = time / 1e-3
+    return (scene.numerics.accuracy or DEFAULT_ACCURACY) * max(share, share**0.5)
+
+
+def growth(scene: Scene, start: InitialState | None) -> float:
+    """How many times a disturbance of 1e-6 um of every node has grown at most, at the ten looks."""
+    import dataclasses
+
+    from warpflag.model.starts import starting_states
+
+    begun = start or starting_states([scene])[0]
+    noise = np.random.default_rng(0)
+    moved = []
+    for nodes in begun.positions:
+        other = nodes.copy()
+        other[1:] += 1e-6 / 3**0.5 * noise.standard_normal(other[1:].shape)
+        moved.append(other)
+    disturbed = dataclasses.replace(begun, positions=tuple(moved))
+    largest = 0.0
+    pair = Simulation([scene, scene], device="cpu", starts=[begun, disturbed])
+    try:
+        for k in range(LOOKS):
+            pair.advance(scene.duration * (k + 1) / LOOKS)
+            both = pair.cells().positions
+            half = len(both) // 2
+            largest = max(largest, float(np.linalg.norm(both[:half] - both[half:], axis=1).max()) / 1e-6)
+    except NumericalError:
+        pass
+    return largest
+
+
+def against_finer(
+    scene: Scene,
+    start: InitialState | None = None,
+    reference: str | None = None,
+    cut_off: float = CUT_OFF,
+    changed: Mapping[str, Any] | None = None,
+) -> Found:
+    """A scene against a finer run.
+
+    Args:
+        scene: whose accuracy is asked for.
+        start: of both; None: the scene's.
+        reference: stepper of the finer run; None: the scene's.
+        cut_off: computing time of each [s].
+        changed: values that the finer run has beside a thirtieth of the accuracy.
+    """
+    seen, seconds, end, sim = looks(scene, start, cut_off)
+    if end and end != "cut off" and not seen:
+        return found("stopped", end, seconds=seconds)
+    accuracy = (scene.numerics.accuracy or DEFAULT_ACCURACY) / FINER
+    own = {"numerics.accuracy": accuracy, "numerics.precision": "float64", "numerics.on_accuracy": "warn"}
+    if reference:
+        own["numerics.stepper"] = reference
+    finer = with_values(scene, {**own, **(changed or {})})
+    exact, _, exact_end, _ = looks(finer, start, cut_off)
+    count = min(len(seen), len(exact))
+    if not count:
+        outcome = "stopped" if end and end != "cut off" else "right"
+        return found(outcome, f"nothing to compare: {end}; finer: {exact_end}", seconds=seconds)
+    shares = [
+        float(np.linalg.norm(seen[k] - exact[k], axis=1).max()) / asked(scene, scene.duration * (k + 1) / LOOKS)
+        for k in range(count)
+    ]
+    numbers = {"seconds": seconds, "error_over_asked": shares[-1], "compared_to": count / LOOKS}
+    numbers["steps"] = int(sim.steps[0]) if sim else 0
+    said = f"error {shares[-1]:.3g} times what was asked at {count / LOOKS:g} of the run"
+    if end and end != "cut off":
+        return found("stopped", f"{end}; {said} before", **numbers)
+    if max(shares) <= BEYOND:
+        return found("right", f"{said}; {end or 'ran'}; finer: {exact_end or 'ran'}", **numbers)
+    parting = growth(scene, start)
+    unstable = "unstable: " if parting > PARTING else ""
+    return found("wrong", f"{unstable}{said}; a disturbance grows {parting:.3g} times", growth=parting, **numbers)
+
+
+def random_scene(seed: int, folder: Path) -> Found:
+    """A random valid scene against a run of a thirtieth of its accuracy."""
+    try:
+        scene = with_values(Scene(name=f"random {seed}"), random_values(seed))
+        return against_finer(scene)
+    except SceneError as error:
+        return found("refused", str(error))
+    except Exception as error:
+        return found("traceback", f"{type(error).__name__}: {error}")
