@@ -95,6 +95,8 @@ def kill(base: Base, seed: int, folder: Path) -> Found:
         process.wait()
         return found("traceback", f"{number.name} after {after:.2f} s: goes on")
     done = f"{number.name} after {after:.2f} of {base.seconds:.2f} s" + (", ended before" if ended_before else "")
+    if number == signal.SIGINT and not directory.exists() and "KeyboardInterrupt" in said:
+        return found("right", f"{done}: before the program began")
     if "Traceback" in said:
         return found("traceback", f"{done}: {said.strip().splitlines()[-1]}")
     if (directory / "run.h5").exists():

@@ -13,7 +13,11 @@ import numpy as np
 from examples.reliability.attempt import Found, found
 from examples.reliability.malformed import malformed
 from warpflag.model.geometry import InitialState
+from warpflag.record.cell_state import CellState
+from warpflag.run.execute import SUSPECT
+from warpflag.run.growth import growth, growth_words
 from warpflag.run.simulation import NumericalError, Simulation
+from warpflag.run.summary import accuracy_kept
 from warpflag.scene import Scene, SceneError, load, with_values
 from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
@@ -25,8 +29,6 @@ LOOKS = 10
 """Times at which two runs are compared."""
 BEYOND = 10.0
 """Error over what was asked from which a run is wrong."""
-PARTING = 100.0
-"""Growth of a disturbance from which the motion counts as unstable."""
 
 
 def malformed_scene(seed: int, folder: Path) -> Found:
@@ -92,9 +94,9 @@ def random_values(seed: int) -> dict[str, Any]:
 
 def looks(
     scene: Scene, start: InitialState | None, cut_off: float
-) -> tuple[list[np.ndarray], float, str, Simulation | None]:
-    """Node positions at equal times to the end of a scene, as far as it comes; computing time [s]; how it ended."""
-    seen: list[np.ndarray] = []
+) -> tuple[list[CellState], float, str, Simulation | None]:
+    """States at equal times to the end of a scene, as far as it comes; computing time [s]; how it ended."""
+    seen: list[CellState] = []
     begin = time.process_time()
 
     class Late(Exception):
@@ -111,7 +113,7 @@ def looks(
         begin = time.process_time()
         for k in range(LOOKS):
             sim.advance(scene.duration * (k + 1) / LOOKS, watch)
-            seen.append(sim.cell_state().positions)
+            seen.append(sim.cell_state())
     except NumericalError as error:
         return seen, time.process_time() - begin, str(error), sim
     except Late:
@@ -125,31 +127,15 @@ def asked(scene: Scene, time: float) -> float:
     return (scene.numerics.accuracy or DEFAULT_ACCURACY) * max(share, share**0.5)
 
 
-def growth(scene: Scene, start: InitialState | None) -> float:
-    """How many times a disturbance of 1e-6 um of every node has grown at most, at the ten looks."""
-    import dataclasses
-
-    from warpflag.model.starts import starting_states
-
-    begun = start or starting_states([scene])[0]
-    noise = np.random.default_rng(0)
-    moved = []
-    for nodes in begun.positions:
-        other = nodes.copy()
-        other[1:] += 1e-6 / 3**0.5 * noise.standard_normal(other[1:].shape)
-        moved.append(other)
-    disturbed = dataclasses.replace(begun, positions=tuple(moved))
-    largest = 0.0
-    pair = Simulation([scene, scene], device="cpu", starts=[begun, disturbed])
-    try:
-        for k in range(LOOKS):
-            pair.advance(scene.duration * (k + 1) / LOOKS)
-            both = pair.cells().positions
-            half = len(both) // 2
-            largest = max(largest, float(np.linalg.norm(both[:half] - both[half:], axis=1).max()) / 1e-6)
-    except NumericalError:
-        pass
-    return largest
+def told(scene: Scene, sim: Simulation, states: list[CellState]) -> str:
+    """What the run itself says of an error beyond what was asked; empty where it says nothing."""
+    kept = accuracy_kept(scene, sim.checkpoint())
+    estimate = (kept["estimate"] or 0.0) / kept["asked"]
+    if scene.numerics.time_step and estimate > BEYOND:
+        return f"fixed steps, whose estimate is {estimate:.3g} times"
+    if estimate > SUSPECT and (found := growth(scene, states, sim.first_node, "cpu")):
+        return growth_words(found)
+    return ""
 
 
 def against_finer(
@@ -169,6 +155,7 @@ def against_finer(
         changed: values that the finer run has beside a thirtieth of the accuracy.
     """
     seen, seconds, end, sim = looks(scene, start, cut_off)
+    states = seen[:: LOOKS // 2]
     if end and end != "cut off" and not seen:
         return found("stopped", end, seconds=seconds)
     accuracy = (scene.numerics.accuracy or DEFAULT_ACCURACY) / FINER
@@ -181,10 +168,10 @@ def against_finer(
     if not count:
         outcome = "stopped" if end and end != "cut off" else "right"
         return found(outcome, f"nothing to compare: {end}; finer: {exact_end}", seconds=seconds)
-    shares = [
-        float(np.linalg.norm(seen[k] - exact[k], axis=1).max()) / asked(scene, scene.duration * (k + 1) / LOOKS)
-        for k in range(count)
-    ]
+    shares = []
+    for k in range(count):
+        error = np.linalg.norm(seen[k].positions - exact[k].positions, axis=1).max()
+        shares.append(float(error) / asked(scene, scene.duration * (k + 1) / LOOKS))
     numbers = {"seconds": seconds, "error_over_asked": shares[-1], "compared_to": count / LOOKS}
     numbers["steps"] = int(sim.steps[0]) if sim else 0
     said = f"error {shares[-1]:.3g} times what was asked at {count / LOOKS:g} of the run"
@@ -192,9 +179,8 @@ def against_finer(
         return found("stopped", f"{end}; {said} before", **numbers)
     if max(shares) <= BEYOND:
         return found("right", f"{said}; {end or 'ran'}; finer: {exact_end or 'ran'}", **numbers)
-    parting = growth(scene, start)
-    unstable = "unstable: " if parting > PARTING else ""
-    return found("wrong", f"{unstable}{said}; a disturbance grows {parting:.3g} times", growth=parting, **numbers)
+    words = told(scene, sim, states) if sim else ""
+    return found("told" if words else "wrong", f"{said}; {words}", **numbers)
 
 
 def random_scene(seed: int, folder: Path) -> Found:

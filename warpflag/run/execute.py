@@ -18,17 +18,20 @@ from warpflag.base.progress import Progress
 from warpflag.record import RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
+from warpflag.run.growth import States, growth
 from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.summary import accuracy_kept
+from warpflag.scene import Scene
 
-__all__ = ["Run"]
+__all__ = ["SUSPECT", "Run"]
 
 _CHECKPOINT_SECONDS = 5.0
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05
 _WRITERS = 8
+SUSPECT = 2.0  # estimate over the accuracy from which the motion is looked at
 _SECONDS_BEFORE_EXPLAINING = 2.0
 
 
@@ -55,6 +58,7 @@ class Run:
         # The last copy of all cells after a block of frames, and when it was taken: what a checkpoint is written from.
         self._copy: dict[str, np.ndarray] = {}
         self._copied_at = -math.inf
+        self._states = States()
 
     @property
     def simulation(self) -> Simulation:
@@ -147,6 +151,8 @@ class Run:
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
             if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):
                 self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
+                if len(self.members) == 1 and not faults:
+                    self._states.add(self.simulation.cell_state())
             self._complete(sorted(at_end))
             self._stop(faults)
             if monotonic() - saved > interval:
@@ -167,13 +173,23 @@ class Run:
         self._save(cells)
         for cell in cells:
             facts, scene = self._facts(cell), self.members[cell].scene
+            self._follow(facts, scene)
             fault = None
             if facts["accuracy"]["beyond"] and scene.numerics.on_accuracy == "stop" and not scene.numerics.time_step:
                 fault = NumericalError(Fault.ACCURACY, float(self._copied_times()[cell]), cell, 0, 0, scene)
-                facts = self._facts(cell, fault)
+                facts = self._facts(cell, fault) | {"growth": facts["growth"]}
             status = "stopped" if fault else "done"
             finish = functools.partial(self.members[cell].finish, status, facts, fault, movie=self.movies)
             self._guarded(cell, finish)
+
+    def _follow(self, facts: dict[str, Any], scene: Scene, stopped: bool = False) -> None:
+        """Whether the motion itself is unstable, where estimates are high or a guard has stopped the run."""
+        kept, found = facts["accuracy"], None
+        high = kept["estimate"] is not None and kept["estimate"] > SUSPECT * kept["asked"]
+        if len(self.members) == 1 and (high or stopped):
+            first_node = self._first_node(0)
+            found = growth(scene, self._states.chosen(), first_node, self.simulation.device.alias)
+        facts["growth"] = {"factor": found[0], "from": found[1]} if found else None
 
     def _copied_times(self) -> np.ndarray:
         """Time of every cell at the last copy [s], shape [cell_count]."""
@@ -197,9 +213,9 @@ class Run:
         """Ends the members whose cells have violated a guard."""
         for c, fault in faults.items():
             member = self.members[c]
-            self._guarded(
-                c, lambda c=c, m=member, f=fault: m.finish("stopped", self._facts(c, f), f, movie=self.movies)
-            )
+            facts = self._facts(c, fault)
+            self._follow(facts, member.scene, stopped=True)
+            self._guarded(c, functools.partial(member.finish, "stopped", facts, fault, movie=self.movies))
 
     def _end(self, ended: Ended) -> None:
         """Ends every member that still goes on, with a checkpoint to resume from."""
@@ -250,6 +266,7 @@ class Run:
             # Of thermal noise: products with the pair sum that its root took.
             "noise_products": copied["stepper.noise_products"][0] if "stepper.noise_products" in copied else 0,
             "accuracy": accuracy_kept(scene, copied),
+            "growth": None,
             "balance": {
                 "judged": getattr(simulation.stepper, "balanced", False),
                 "violations": copied["stepper.balance_refused"][0] if "stepper.balance_refused" in copied else 0,

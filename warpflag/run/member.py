@@ -20,6 +20,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter, versions
 from warpflag.run import checkpoint
 from warpflag.run.faults import NumericalError
+from warpflag.run.growth import growth_words
 from warpflag.run.lock import Lock
 from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, sync, write_whole
 from warpflag.run.stop import Ended
@@ -176,7 +177,9 @@ class Member:
                 left_out = _movie(record, self.directory / MOVIE_NAME)
         count = found["frames"]
         reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
-        kept = kept_words(facts["accuracy"])
+        grown = facts["growth"]
+        grown = growth_words((grown["factor"], grown["from"])) if grown else ""
+        kept = "; ".join(filter(None, (kept_words(facts["accuracy"]), grown)))
         if status == "done":
             said = f", {kept}" if kept else ""
             return f"{reached} in {self.wall_time:.1f} s{said}: {self.directory}{left_out}"
