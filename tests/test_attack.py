@@ -21,7 +21,16 @@ SEED = 5
 
 def test_the_attack_finds_nothing(tmp_path):
     """One command; the same command again has nothing left to try."""
-    line = [sys.executable, str(ROOT / "examples/reliability/attack.py"), "-o", str(tmp_path), "--seed", str(SEED)]
+    line = [
+        sys.executable,
+        str(ROOT / "examples/reliability/attack.py"),
+        "-o",
+        str(tmp_path),
+        "--seed",
+        str(SEED),
+        "--cut-off",
+        "3",
+    ]
     line += ["--counts", *(f"{kind}={count}" for kind, count in COUNTS.items())]
     ended = subprocess.run(line, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stdout + ended.stderr

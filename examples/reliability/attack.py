@@ -138,12 +138,15 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kinds", nargs="+", choices=list(COUNTS), default=list(COUNTS))
     parser.add_argument("--counts", nargs="+", default=[], metavar="KIND=N", help="attempts of a kind")
+    parser.add_argument("--cut-off", type=float, help="computing time of a finer run [s] (default: 60, extremes 10)")
     parser.add_argument("-o", dest="folder", type=Path, default=Path("runs/attack"), help="(default: runs/attack)")
     parser.add_argument("--again", nargs=2, metavar=("KIND", "N"), help="one attempt, and what came of it")
     options = parser.parse_args()
     attack = Attack(options.folder.absolute(), options.seed)
     root = Path(__file__).parent.parent.parent
     os.environ.setdefault("PYTHONPATH", os.pathsep.join([str(root), str(root / "kernels")]))
+    if options.cut_off:
+        scenes.CUT_OFF = extremes.CUT_OFF = options.cut_off
     if options.again:
         print(attack.attempt(options.again[0], int(options.again[1])))
         return 0

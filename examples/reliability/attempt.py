@@ -15,11 +15,17 @@ import numpy as np
 
 from warpflag.record import Record
 
-OUTCOMES = ("right", "told", "refused", "stopped", "wrong", "lost", "traceback")
-"""right: the numbers of an undisturbed or a finer run. told: farther from those than ten times what was asked, and the
-run says why: fixed steps with an estimate beyond that, or an unstable motion. refused: one line and status 2, or 1 where
-the machine failed. stopped: by a guard, one line and status 3. wrong: other numbers, or an end that says nothing. lost:
-what was committed can't be read, or a run can't go on. traceback: more than a user should see, a crash, or no end."""
+OUTCOMES = ("right", "told", "unfinished", "refused", "stopped", "wrong", "lost", "traceback")
+"""right: the numbers of an undisturbed or a finer run.
+told: farther from those than ten times what was asked, and the run says why: fixed steps whose estimate is beyond that
+too, or an unstable motion.
+unfinished: too slow for anything to be compared before the cut-off.
+refused: one line and status 2, or 1 where the machine failed.
+stopped: by a guard, one line and status 3.
+wrong: other numbers, or an end that says nothing.
+lost: what was committed can't be read, or a run can't go on.
+traceback: more than the lines that a user should see, a crash, or no end.
+"""
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE = 120.0
 """Wall time after which a command is taken to hang [s]."""

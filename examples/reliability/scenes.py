@@ -142,7 +142,7 @@ def against_finer(
     scene: Scene,
     start: InitialState | None = None,
     reference: str | None = None,
-    cut_off: float = CUT_OFF,
+    cut_off: float | None = None,
     changed: Mapping[str, Any] | None = None,
 ) -> Found:
     """A scene against a finer run.
@@ -151,9 +151,10 @@ def against_finer(
         scene: whose accuracy is asked for.
         start: of both; None: the scene's.
         reference: stepper of the finer run; None: the scene's.
-        cut_off: computing time of each [s].
+        cut_off: computing time of each [s]; None: `CUT_OFF`.
         changed: values that the finer run has beside a thirtieth of the accuracy.
     """
+    cut_off = cut_off or CUT_OFF
     seen, seconds, end, sim = looks(scene, start, cut_off)
     states = seen[:: LOOKS // 2]
     if end and end != "cut off" and not seen:
@@ -166,7 +167,7 @@ def against_finer(
     exact, _, exact_end, _ = looks(finer, start, cut_off)
     count = min(len(seen), len(exact))
     if not count:
-        outcome = "stopped" if end and end != "cut off" else "right"
+        outcome = "stopped" if end and end != "cut off" else "unfinished"
         return found(outcome, f"nothing to compare: {end}; finer: {exact_end}", seconds=seconds)
     shares = []
     for k in range(count):
