@@ -148,7 +148,7 @@ def damage(base: Base, seed: int, folder: Path) -> Found:
         "summary": "summary.json",
         "scene": "scene.toml",
         "checkpoint": chance.choice(sorted(p.name for p in directory.glob("checkpoint-*.npz")) or ["run.h5"]),
-        "table": chance.choice(sorted(p.name for p in directory.iterdir() if p.is_file())),
+        "table": chance.choice(sorted(p.name for p in directory.iterdir() if p.is_file() and p.stat().st_size)),
     }
     path = directory / names[kind]
     how, content = damaged(path.read_bytes(), seed)

@@ -14,7 +14,7 @@ from examples.reliability import attack, extremes, scenes
 from examples.reliability.attempt import OUTCOMES, problem
 from warpflag.scene import Scene, with_values
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 COUNTS = {"kills": 3, "limits": 2, "damage": 5, "malformed": 30, "random": 2, "extremes": 3}
 SEED = 5
 
