@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from warpflag import __version__, sweep_command, tradeoff_command
 from warpflag.base.output import machine_error
-from warpflag.base.streams import protected_streams
+from warpflag.base.streams import explained_cache, protected_streams
 
 if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
@@ -36,6 +36,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 @protected_streams()
+@explained_cache
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command; returns its exit status."""
     options = _parser().parse_args(arguments)

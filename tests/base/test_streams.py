@@ -145,3 +145,21 @@ def test_what_is_printed_to_sound_streams_arrives(capsys):
         print("out")
         print("error", file=sys.stderr)
     assert capsys.readouterr() == ("out\n", "error\n")
+
+
+def test_a_cache_that_warp_cannot_read_is_one_line(tmp_path):
+    """A kernel's description that is damaged: no kernel is compiled or run."""
+    from warpflag.base.device import start_warp
+    from warpflag.base.streams import explained_cache
+
+    wp = start_warp()
+    code = "def load(): b'\\xb8'.decode()\nload()\n"
+    place = compile(code, str(Path("warp", "_src", "context.py")), "exec")
+    with pytest.raises(UnicodeDecodeError):
+        exec(compile(code, "elsewhere.py", "exec"), {})
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        assert explained_cache(lambda: exec(place, {}) or 0)() == 1
+    assert str(wp.config.kernel_cache_dir) in said.getvalue() and said.getvalue().count("\n") == 1
+    with pytest.raises(KeyError):
+        explained_cache(lambda: {}["x"])()

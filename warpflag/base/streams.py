@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
-__all__ = ["is_terminal", "protected_streams", "say"]
+__all__ = ["explained_cache", "is_terminal", "protected_streams", "say"]
 
 
 def say(text: str, stream: TextIO | None = None) -> bool:
@@ -93,3 +94,31 @@ class _Protected:
                 nowhere = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nowhere, self._descriptor)
                 os.close(nowhere)
+
+
+def explained_cache(command: Callable[..., int]) -> Callable[..., int]:
+    """A command that tells in one line, with status 1, that Warp can't read a kernel from its cache."""
+
+    @functools.wraps(command)
+    def explained(*arguments: Any) -> int:
+        try:
+            return command(*arguments)
+        except Exception as error:
+            if not _is_of_cache(error):
+                raise
+            folder, words = sys.modules["warp"].config.kernel_cache_dir, " ".join(str(error).split())
+            say(f"warpflag: kernel cache {folder}: can't be read ({words}); without it kernels compile anew\n")
+            return 1
+
+    return explained
+
+
+def _is_of_cache(error: BaseException) -> bool:
+    """Whether an error comes from where Warp loads a module's kernels."""
+    place = error.__traceback__
+    while place is not None:
+        code = place.tb_frame.f_code
+        if code.co_name == "load" and code.co_filename.endswith(os.path.join("warp", "_src", "context.py")):
+            return True
+        place = place.tb_next
+    return False
