@@ -199,9 +199,7 @@ class Scene(Section, key=""):
             raise SceneError(key, temperature, problem, ["motor.law", "motor.switching"])
         mode, numerics = self.hydrodynamics.mode, self.numerics
         if mode in ("between", "as_printed"):
-            problem = (
-                f"has no noise: that mobility is not positive definite; {key} needs none, within, all or consistent"
-            )
+            problem = f"must be none, within, all or consistent with {key}: its mobility is not positive definite"
             raise SceneError("hydrodynamics.mode", mode, problem, related)
         if self.hydrodynamics.body_flow:
             raise SceneError("hydrodynamics.body_flow", True, f"takes no {key} yet", related)
