@@ -60,7 +60,8 @@ def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
 
 @functools.cache
 def functions(p: Precision, pairs: bool) -> SimpleNamespace:
-    """Device functions of the local part, with or without a pair sum: `self_mobility`, `excess_root`, `drift`."""
+    """Device functions of the local part, with or without a pair sum: `self_mobility`,
+    `node_tangent`, `excess_root`, `drift`."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     four_thirds, two = wp.constant(real(4.0 / 3.0)), wp.constant(real(2.0))
@@ -111,7 +112,7 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
         g = projector(mean) * bracket * (real(1.0) / total)
         return scale * (wp.trace(g) * mean + g * mean)
 
-    return SimpleNamespace(self_mobility=self_mobility, excess_root=excess_root, drift=drift)
+    return SimpleNamespace(self_mobility=self_mobility, node_tangent=node_tangent, excess_root=excess_root, drift=drift)
 
 
 @functools.cache
