@@ -86,3 +86,22 @@ def test_rkc_controls_its_steps_unless_told_otherwise(device):
         ends.append(sim.state.positions)
     errors = [np.linalg.norm(end - ends[1], axis=1).max() for end in ends]
     assert errors[0] < 2 * 5e-3 * 0.1 < errors[2]
+
+
+def test_words_for_the_accuracy_choose_it_and_the_precision_of_large_pair_sums():
+    from warpflag.model.terms import switches_of
+    from warpflag.scene import Scene, SceneError, dumps, loads, with_values
+
+    scene = Scene(name="levels")
+    assert scene.numerics.asked == 5e-3
+    small_and_large = {"flagella.count": 2}, {"flagella.count": 40, "body.length": 40.0, "body.width": 6.0}
+    for word, asked, short in (("draft", 5e-2, True), ("standard", 5e-3, True), ("careful", 5e-4, False)):
+        for values, large in zip(small_and_large, (False, True), strict=True):
+            own = with_values(scene, {"numerics.accuracy": word, **values})
+            assert own.numerics.asked == asked and loads(dumps(own)) == own
+            assert switches_of(own).short_pairs == (short and large)
+            by_hand = with_values(own, {"numerics.pair_precision": "same"})
+            assert not switches_of(by_hand).short_pairs
+    assert not switches_of(with_values(scene, small_and_large[1])).short_pairs  # a number, or nothing, changes nothing
+    with pytest.raises(SceneError, match="draft, standard, careful"):
+        with_values(scene, {"numerics.accuracy": "sloppy"})

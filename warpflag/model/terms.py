@@ -155,12 +155,12 @@ def switches_of(scene: Scene) -> Switches:
         pairs = {"all": "within", "between": "none"}.get(pairs, pairs)
     if not scene.body.enabled and pairs == "within":
         pairs = "free"
-    numerics = scene.numerics
+    numerics, segments = scene.numerics, sum(spec.segment_count for spec in scene.resolved_flagella())
     unequal = pairs != "none" and len(set(pair_radii(scene))) > 1
     return Switches(
         flows=Flows(pairs, unequal=unequal, body=scene.hydrodynamics.body_flow),
         terms=tuple(term.name for term in SCENE_TERMS if term.needed(scene)),
-        short_pairs=pairs != "none" and (numerics.precision, numerics.pair_precision) == ("float64", "float32"),
+        short_pairs=pairs != "none" and numerics.short_pairs(segments),
         noise=scene.fluid.temperature > 0.0,
     )
 

@@ -13,7 +13,6 @@ from warpflag import observables
 from warpflag.observables.behaviour import of_record as behaviour
 from warpflag.record import Record
 from warpflag.scene import Scene
-from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
 __all__ = ["accuracy_kept", "digest", "kept_words", "plain"]
 
@@ -62,7 +61,7 @@ def accuracy_kept(scene: Scene, checkpoint: Mapping[str, np.ndarray]) -> dict[st
         ends here has erred by more than ten times what was asked. `steps_at_shortest`: steps that were wanted shorter
         than the shortest that an estimate may ask for.
     """
-    asked = scene.numerics.accuracy or DEFAULT_ACCURACY
+    asked = scene.numerics.asked
     facts = {"asked": asked, "estimate": None, "worst_window": None, "worst_window_end": None, "beyond": False}
     facts["steps_at_shortest"] = 0
     if "stepper.achieved_total" not in checkpoint or scene.numerics.stepper == "euler":

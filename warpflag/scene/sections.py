@@ -16,6 +16,12 @@ from warpflag.scene.settings import Section, choice, integer, number, numbers, s
 MOTOR_LAWS = ("constant", "torque_speed", "rate")
 
 
+ACCURACY_LEVELS = {"draft": 5e-2, "standard": 5e-3, "careful": 5e-4}
+"""Node error per simulated ms that the words for `numerics.accuracy` ask for [um]."""
+SHORT_PAIRS_IN, SHORT_PAIRS_FROM = ("draft", "standard"), 1000
+"""Levels, and numbers of segments, at which flows of pairs in float32 save a good part of a step and change nothing."""
+
+
 @dataclass(frozen=True)
 class Flagella(Section, key="flagella"):
     """The group of flagella: how many, their shape, their elasticity and where they sit.
@@ -289,22 +295,37 @@ class Numerics(Section, key="numerics"):
         derived="from numerics.accuracy; euler: just below its stability limit",
     )
     precision: str = choice("float64", ("float64", "float32"), "floating point numbers of forces and positions")
-    accuracy: float | None = number(
+    accuracy: float | str | None = number(
         None,
         "um",
         1e-9,
         1,
-        "wanted node error per simulated ms",
+        "wanted node error per simulated ms; draft: 5e-2, standard: 5e-3, careful: 5e-4",
+        choices=tuple(ACCURACY_LEVELS),
         derived="5e-3, but euler takes fixed steps",
     )
     on_accuracy: str = choice(
         "stop", ("stop", "warn"), "what happens when error estimates are beyond ten times the accuracy"
     )
-    pair_precision: str = choice(
-        "same",
+    pair_precision: str | None = choice(
+        None,
         ("same", "float32"),
         "numbers of the flow of one pair; float32: those alone, added up in numerics.precision",
+        derived="same; float32 with accuracy draft or standard (the words) from a thousand segments on",
     )
+
+    @property
+    def asked(self) -> float:
+        """Node error per simulated ms that steps are to keep [um]."""
+        given = "standard" if self.accuracy is None else self.accuracy
+        return ACCURACY_LEVELS[given] if isinstance(given, str) else given
+
+    def short_pairs(self, segments: int) -> bool:
+        """Whether flows of pairs are taken in float32 in a run in float64, with so many segments."""
+        wanted = self.pair_precision == "float32"
+        if self.pair_precision is None:
+            wanted = self.accuracy in SHORT_PAIRS_IN and segments >= SHORT_PAIRS_FROM
+        return wanted and self.precision == "float64"
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Setting:
         high: greatest value, inclusive.
         usual: magnitudes that a number in this unit usually has; a number that has such a magnitude if it is taken in
             the SI unit is refused. For ranges that include zero, whose bounds find no number in the wrong unit.
-        choices: what a choice may be.
+        choices: what a choice may be, and words that a number may be instead.
         pattern: regular expression of a text.
         pattern_text: the same in words.
         derived: what stands in for an absent value; empty where a value is required.
@@ -63,6 +63,8 @@ class Setting:
     def bounds(self) -> str:
         """The allowed values in short; empty for a switch."""
         span = f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+        if self.kind == "number" and self.choices:
+            span += ", or " + ", ".join(self.choices)
         words = {"choice": "one of " + ", ".join(self.choices), "text": self.pattern_text, "switch": ""}
         return words.get(self.kind, span)
 
@@ -103,6 +105,8 @@ class Setting:
             found = tuple(float(self._number(key, value, _plain(item))) for item in value)
             if all(a < b for a, b in itertools.pairwise(found)):
                 return found
+        if self.kind == "number" and isinstance(value, str) and value in self.choices:
+            return value
         if self.kind == "number":
             return float(self._number(key, value, value))
         if self.kind == "integer" and isinstance(value, int):

@@ -13,6 +13,7 @@ from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import pace
+from warpflag.scene.sections import ACCURACY_LEVELS
 
 __all__ = [
     "DEFAULT_ACCURACY",
@@ -36,7 +37,7 @@ class System:
     guard: Any
 
 
-DEFAULT_ACCURACY = 5.0e-3
+DEFAULT_ACCURACY = ACCURACY_LEVELS["standard"]
 """Node error per simulated time that step control keeps when `numerics.accuracy` is absent [um/ms]."""
 FIRST_STEP = 1.0e-8
 """First step under control after a start, when nothing is known of the motion yet [s]."""
@@ -54,7 +55,7 @@ def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
 
 def allocated_control(scenes: Sequence[Scene], fixed: Sequence[bool], device: Any) -> Any:
     """The struct `StepControl` of scenes, of which some have fixed steps."""
-    accuracies = [scene.numerics.accuracy or DEFAULT_ACCURACY for scene in scenes]
+    accuracies = [scene.numerics.asked for scene in scenes]
     stopping = [scene.numerics.on_accuracy == "stop" for scene in scenes]
     return step_control.allocate(accuracies, fixed, stopping, [pace(scene) for scene in scenes], device)
 

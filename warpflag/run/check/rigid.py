@@ -66,7 +66,7 @@ def _mobility(scene: Scene, spec: FlagellumSpec, x: Array) -> Array:
     own = weight * (local.along * along + local.across * (np.eye(3) - along))
     m = np.zeros((count, 3, count, 3))
     if scene.hydrodynamics.mode in ("within", "all", "as_printed", "consistent"):
-        m += _rotne_prager(x, pair_radius(scene), scene.fluid.viscosity)
+        m += _rotne_prager(x, pair_radius(scene, spec.segment_length), scene.fluid.viscosity)
     m[np.arange(count), :, np.arange(count), :] = own
     return m.reshape(3 * count, 3 * count)
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpflag.run.tradeoff.points import MEASURES, Point
+from warpflag.scene.sections import ACCURACY_LEVELS
 
 __all__ = ["LEVELS", "Row", "Summary", "compared", "front", "recommended", "summaries"]
 
-LEVELS = {"draft": 5e-2, "standard": 5e-3, "careful": 5e-4}
+LEVELS = ACCURACY_LEVELS
 """Node error per simulated ms that each level of care allows [um]."""
 _TIMED = ("time step", "precision")
 

@@ -48,6 +48,9 @@ class Study:
     """
 
     def __init__(self, scene: Scene, output: str | None, device: str | None, record: str | None = None) -> None:
+        if scene.fluid.temperature:
+            problem = "must be 0 for a trade-off: paths with thermal noise have nothing to converge to"
+            raise SceneError("fluid.temperature", scene.fluid.temperature, problem)
         Simulation(scene, device=device)  # refuses what can't be simulated, before anything is written
         self._scene, self._device, self._record = scene, device, record
         self.directory = Path(output or f"runs/{scene.name}-tradeoff")
