@@ -32,7 +32,8 @@ def draw(found: Sequence[Summary], title: str, path: Path) -> None:
         best = front(found)
         axis.plot([s.error for s in best], [s.cost for s in best], "-", lw=0.8, color="0.5", zorder=0, label="front")
         for k, s in enumerate(best):
-            axis.annotate(f"{k + 1}", (s.error, s.cost), textcoords="offset points", xytext=(-6, -9), fontsize=7)
+            beside = (-6, -9) if k % 2 == 0 else (3, 4)
+            axis.annotate(f"{k + 1}", (s.error, s.cost), textcoords="offset points", xytext=beside, fontsize=7)
         axis.set(xscale="log", yscale="log")
         axis.set_xlabel("largest node error per simulated ms [µm]")
         axis.set_ylabel("computing per simulated ms [ms]")
