@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         Hydrodynamics,
         Motor,
         Numerics,
+        Polymorphs,
         Start,
         Steric,
     )
@@ -36,6 +37,7 @@ __all__ = [
     "Motor",
     "NumericalError",
     "Numerics",
+    "Polymorphs",
     "Record",
     "Recorder",
     "Scene",
@@ -60,6 +62,7 @@ _HOMES = {
     "Motor": "scene.sections",
     "NumericalError": "run.simulation",
     "Numerics": "scene.sections",
+    "Polymorphs": "scene.sections",
     "Record": "record",
     "Recorder": "record.recorder",
     "Scene": "scene",

@@ -99,6 +99,23 @@ def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) 
     data.hook.helix_axis = wp.array(axes, dtype=precision.vec3, device=device)
 
 
+def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+    own = data.rod.rest_strain.numpy().astype(np.float64)
+    first = data.first_node.numpy()
+    both, specs = np.repeat(own, 2, axis=0), [(s, spec) for s in scenes for spec in s.resolved_flagella()]
+    for k, (scene, spec) in enumerate(specs):
+        target = spec.segment_length * np.array(getattr(scene.polymorphs, scene.polymorphs.target))
+        if scene.flagella.intrinsic_curvature[2] > 0.0:  # a right-handed filament has the mirror images of all forms
+            target *= (-1.0, 1.0, -1.0)
+        both[2 * first[k] + 1 : 2 * first[k + 1] : 2] = target
+    forms = [scene.polymorphs for scene, _ in specs]
+    m, pairs = data.polymorphs, functools.partial(wp.array, dtype=wp.vec2d, device=device)
+    m.rest_strain = wp.array(both, dtype=precision.vec3, device=device)
+    m.ramp = wp.array([f.ramp for f in forms], dtype=wp.float64, device=device)
+    m.nucleation = pairs(np.array([(f.nucleation, -f.nucleation_back) for f in forms]))
+    m.propagation = pairs(np.array([(f.propagation, f.propagation_back) for f in forms]))
+
+
 def _external_forces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return np.array(scene.external.force_per_length), np.array(scene.external.body_force)
 
@@ -132,6 +149,7 @@ SCENE_TERMS = (
         fill=_fill_motor_law,
         power=_motor_power,
     ),
+    SceneTerm("polymorphs", lambda scene: scene.polymorphs.enabled, fill=_fill_polymorphs),
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque and scene.body.enabled),
     SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),

@@ -341,6 +341,9 @@ class Simulation:
         carried |= {f"chart.{name}": getattr(chart, name) for name in _KEPT_CHART}
         if self.system.model.switches.steric:
             carried["guard.position"] = self.system.guard.position
+        if self.system.model.switches.has("polymorphs"):
+            forms = self.system.state.data.forms
+            carried |= {"forms.form": forms.form, "forms.changed": forms.changed}
         return carried
 
     @alone

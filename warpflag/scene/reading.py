@@ -20,6 +20,7 @@ from warpflag.scene.sections import (
     Hydrodynamics,
     Motor,
     Numerics,
+    Polymorphs,
     Start,
     Steric,
 )
@@ -28,7 +29,8 @@ from warpflag.scene.settings import Section, Setting
 __all__ = ["dumps", "load", "loads", "with_values"]
 
 _SECTIONS: dict[str, type[Section]] = {
-    cls.key: cls for cls in (Flagella, Motor, Hook, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
+    cls.key: cls
+    for cls in (Flagella, Motor, Hook, Polymorphs, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
 }
 _KEYS: dict[str, Setting] = {
     f"{cls.key}.{name}".lstrip("."): setting

@@ -25,6 +25,7 @@ from warpflag.scene.sections import (
     Hydrodynamics,
     Motor,
     Numerics,
+    Polymorphs,
     Start,
     Steric,
 )
@@ -93,6 +94,7 @@ class Scene(Section, key=""):
     flagellum: tuple[FlagellumOverride, ...] = ()
     motor: Motor = dataclasses.field(default_factory=Motor)
     hook: Hook = dataclasses.field(default_factory=Hook)
+    polymorphs: Polymorphs = dataclasses.field(default_factory=Polymorphs)
     fluid: Fluid = dataclasses.field(default_factory=Fluid)
     hydrodynamics: Hydrodynamics = dataclasses.field(default_factory=Hydrodynamics)
     steric: Steric = dataclasses.field(default_factory=Steric)

@@ -180,6 +180,28 @@ class Hook(Section, key="hook"):
 
 
 @dataclass(frozen=True)
+class Polymorphs(Section, key="polymorphs"):
+    """Forms that the filament changes to under its own moment, joint by joint: those of a bacterial flagellum.
+
+    Moments are about the helix axis, against the handedness of the ground state, as a reversed motor winds it up.
+    Thresholds of nucleation: Hotani, J. Mol. Biol. 156, 791 (1982). Those of propagation lie on both sides of the
+    middle of these two, which is a choice. Strains of the target: from pitch and radius, semicoiled and curly-1 with
+    half the pitch of the normal form (Darnton & Berg, Biophys. J. 92, 2230 (2007)).
+    """
+
+    enabled: bool = switch(False, "joints flip between the ground state and the target")
+    target: str = choice("semicoiled", ("semicoiled", "curly_1", "coiled"), "form that reversed motors lead to")
+    semicoiled: tuple[float, float, float] = vector((0.0, 2.84, 2.29), "1/um", -100, 100, "strain of that form")
+    curly_1: tuple[float, float, float] = vector((0.0, 2.61, 4.19), "1/um", -100, 100, "strain of that form")
+    coiled: tuple[float, float, float] = vector((0.0, 1.82, -0.6), "1/um", -100, 100, "strain of that form")
+    nucleation: float = number(1.1, "pN um", 0, 1e3, "moment at which root or tip flips to the target")
+    nucleation_back: float = number(0.4, "pN um", -1e3, 1e3, "moment the other way at which it flips back")
+    propagation: float = number(0.4, "pN um", -1e3, 1e3, "moment at which a joint beside the target flips to it")
+    propagation_back: float = number(0.3, "pN um", -1e3, 1e3, "moment below which one beside the other form flips back")
+    ramp: float = number(2e-4, "s", 1e-6, 1, "time in which the ground state of a joint changes")
+
+
+@dataclass(frozen=True)
 class Fluid(Section, key="fluid"):
     """The fluid and the drag of a filament in it, per unit length.
 

@@ -20,6 +20,7 @@ _KNOWN = (
     ("motor_rate", "motor rate", "", "Hz"),
     ("motor_torque", "motor torque", "", "pN µm"),
     ("motor_drive", "motor drive", "", ""),
+    ("target_form_share", "share in the target form", "", ""),
     ("body_rate", "body rate", "", "Hz"),
     ("elastic_energy", "elastic energy", "", "pN µm"),
 )

@@ -57,14 +57,13 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Polymorphs:
-        """Forms of a flagellum, see rod/polymorphs.py; per flagellum [K] unless said otherwise."""
+        """Two forms of every joint, see rod/polymorphs.py; per flagellum [K] unless said otherwise."""
 
-        rest_strain: wp.array(dtype=vec3)  # [4 K], h Omega^0 of the four forms [rad]
-        ramp: wp.array(dtype=wp.float64)  # in which the ground state changes [s]
-        target: wp.array(dtype=wp.int32)  # form that a reversed motor leads to
-        # Moments [pN um]: at root and tip, and beside a joint of the other form; toward the target, and back.
-        nucleation: wp.array(dtype=wp.vec2d)
-        propagation: wp.array(dtype=wp.vec2d)
+        rest_strain: wp.array(dtype=vec3)  # [2 E], h Omega^0 of form 0 and of form 1 of every joint [rad]
+        ramp: wp.array(dtype=wp.float64)  # in which a ground state changes [s]
+        # Moments beyond which joints flip to form 1, and below which they flip back [pN um].
+        nucleation: wp.array(dtype=wp.vec2d)  # at root and tip
+        propagation: wp.array(dtype=wp.vec2d)  # beside a joint of the other form
 
     @wp.struct
     class Hook:
@@ -153,12 +152,11 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Forms:
-        """Form of every joint [E], and its ground state now; only with polymorphs."""
+        """Forms of the joints [E]; only with polymorphs."""
 
-        form: wp.array(dtype=wp.int32)
-        before: wp.array(dtype=wp.int32)  # the form that it had until `changed`
-        changed: wp.array(dtype=wp.float64)  # when [s]
-        rest_strain: wp.array(dtype=vec3)  # h Omega^0 at the time of the evaluation [rad]
+        form: wp.array(dtype=wp.int32)  # 0 or 1
+        changed: wp.array(dtype=wp.float64)  # when it flipped last [s]
+        rest_strain: wp.array(dtype=vec3)  # the array of `Rod`, which changes with time here [rad]
 
     @wp.struct
     class State:
@@ -289,7 +287,7 @@ def allocate_state(model: DeviceModel) -> Any:
         for name in ("torque", "held", "slope"):
             setattr(s.motor, name, zeros(flagella, p.real))
     if model.switches.has("polymorphs"):
-        s.forms.form, s.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
+        s.forms.form = zeros(elements, wp.int32)
         s.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
-        s.forms.rest_strain = zeros(elements, p.vec3)
+        s.forms.rest_strain = model.data.rod.rest_strain
     return s

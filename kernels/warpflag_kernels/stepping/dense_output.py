@@ -92,6 +92,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         dense.position[i] = state.pose.position[e]
         dense.director[i] = state.pose.director[e]
         dense.energy[i] = energy[e]
+        if dense.form.shape[0] > 0:
+            dense.form[i] = state.forms.form[e]
         if dense.steric.shape[0] > 0:
             dense.steric[i] = steric[e]
         k = model.flagellum_of[e]

@@ -53,6 +53,7 @@ def struct(p: Precision) -> Any:
         body_orientation: wp.array(dtype=wp.quatd)  # [M C]
         motor_angle: wp.array(dtype=wp.float64)  # [M K] [rad]
         body_angle: wp.array(dtype=wp.float64)  # [M C] [rad]
+        form: wp.array(dtype=wp.int32)  # [M E], of the joints; only with polymorphs
         motor_torque: wp.array(dtype=real)  # [M K], in the step with the frame; only if not constant [pN um]
 
     return Dense
@@ -111,6 +112,7 @@ def allocate(model: DeviceModel, state: DeviceState) -> DenseOutput:
     d.steric = zeros(m * elements if model.switches.steric else 0, p.real)
     d.body_position, d.body_orientation = zeros(m * cells, wp.vec3d), zeros(m * cells, wp.quatd)
     d.motor_angle = zeros(m * flagella, wp.float64)
+    d.form = zeros(m * elements if model.switches.has("polymorphs") else 0, wp.int32)
     d.motor_torque = zeros(m * flagella if model.switches.has("motor law") else 0, p.real)
 
     own = structs(p).State()

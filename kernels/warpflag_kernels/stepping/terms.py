@@ -8,9 +8,10 @@ from warpflag_kernels.motor.torque import MOTOR
 from warpflag_kernels.rod.elastic import BEARING, ELASTIC
 from warpflag_kernels.rod.external import EXTERNAL
 from warpflag_kernels.rod.free_end import FREE_END
+from warpflag_kernels.rod.polymorphs import POLYMORPHS
 
 TERMS = (
-    *(MOTOR, MOTOR_LAW, ELASTIC, BEARING, HOOK, STERIC, STERIC_WITH_SELF),
+    *(MOTOR, MOTOR_LAW, POLYMORPHS, ELASTIC, BEARING, HOOK, STERIC, STERIC_WITH_SELF),
     *(BODY_CONTACT, EXTERNAL, FREE_END),
 )
 

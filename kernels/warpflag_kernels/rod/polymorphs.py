@@ -1,0 +1,216 @@
+"""Polymorphs: every joint of a flagellum is in one of two forms, helices of their own, and flips between them.
+
+The forms are that of the scene's ground state, 0, and a target, 1. What flips a joint is the moment about the helix
+axis against the handedness of form 0, as a reversed motor winds a filament up. Joints near the root or the tip flip by
+themselves (nucleation) when their moment along the ground state,
+
+    m = -(A (Omega - Omega_p)) . Omega_p/|Omega_p|,     Omega_p: ground state of its form; other sign if of other hand,
+
+exceeds one threshold, and back when it falls below another; in a helix that is wound up uniformly it is the moment
+about the axis. Any joint flips beside one of the other form (propagation) at lower thresholds. There the local m would
+not do: a joint of semicoiled form amid the normal one has an eighth of it, and a kinked filament is bent by its
+thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels.
+
+A joint's ground state goes over within a ramp, as a smooth step, so that the steppers see quadratic energies that
+change with time. Joints are looked at where a step has been accepted, and neither flip nor lead to a flip while their
+ramp lasts.
+
+Source: Hotani, J. Mol. Biol. 156, 791 (1982): torques of -1.1 and +0.4 pN um take filaments from normal to semicoiled
+and back, in transitions that travel along the filament.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warpflag_kernels.base import clock
+from warpflag_kernels.base.clock import Control
+from warpflag_kernels.base.precision import Precision
+from warpflag_kernels.base.term import Term
+from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.rod import comoving_chart as chart_stage
+from warpflag_kernels.rod import rotations
+
+# Contour length at either end in which joints flip by themselves [um]. The very first ones are not in the state of a
+# uniform helix: under 1.26 pN um they carry 0.95, 1.18, 1.16.
+END_LENGTH = 0.5
+
+
+@functools.cache
+def functions(p: Precision) -> SimpleNamespace:
+    """Device functions of the term: the ground states at the time of an evaluation."""
+    Model, State = structs(p).Model, structs(p).State
+    module = p.module("polymorph_functions")
+
+    @wp.func(module=module)
+    def ramped(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32):
+        """Sets the ground state of joint e."""
+        own = model.polymorphs.rest_strain[2 * e + state.forms.form[e]]
+        share = (state.time[c] - state.forms.changed[e]) / model.polymorphs.ramp[k]
+        if share < wp.float64(1.0):
+            s = p.real(wp.max(share, wp.float64(0.0)))
+            s = s * s * (p.real(3.0) - p.real(2.0) * s)
+            own = (p.real(1.0) - s) * model.polymorphs.rest_strain[2 * e + 1 - state.forms.form[e]] + s * own
+        state.forms.rest_strain[e] = own
+
+    @wp.func(module=module)
+    def in_flagellum(model: Model, state: State, k: wp.int32, c: wp.int32):
+        e = model.first_node[k]
+        while e + 1 < model.first_node[k + 1]:
+            ramped(model, state, e, k, c)
+            e += 1
+
+    return SimpleNamespace(ramped=ramped, in_flagellum=in_flagellum)
+
+
+@functools.cache
+def _kernels(p: Precision) -> SimpleNamespace:
+    real, vec3 = p.real, p.vec3
+    Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
+    ramped, joint_strain = functions(p).ramped, rotations.functions(p).joint_strain
+    advanced = clock.functions().advanced
+    end_length, half_turn = wp.constant(real(END_LENGTH)), wp.constant(real(math.pi))
+    module = p.module("polymorphs")
+
+    @wp.kernel(module=module)
+    def ground_states(
+        # Model:
+        model: Model,
+        # Out:
+        state: State,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0:
+            ramped(model, state, e, model.flagellum_of[e], c)
+
+    @wp.func(module=module)
+    def strain_change(model: Model, state: State, chart: Chart, e: wp.int32):
+        """Strain of joint e beyond its ground state now [rad]."""
+        w = joint_strain(
+            chart.base.tangent[e], chart.base.tangent[e + 1], chart.base.director[e], chart.base.director[e + 1]
+        )
+        return w - state.forms.rest_strain[e]
+
+    @wp.func(module=module)
+    def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32):
+        """Moment of joint e along its ground state, against the handedness of form 0 [pN um]."""
+        rest = model.polymorphs.rest_strain[2 * e + state.forms.form[e]]
+        d = strain_change(model, state, chart, e)
+        a = model.rod.bending_rigidity[k]
+        moment = vec3(a * d[0], a * d[1], model.rod.twist_rigidity[k] * d[2])
+        m = -wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k])
+        if rest[2] * model.polymorphs.rest_strain[2 * e][2] < real(0.0):
+            m = -m
+        return wp.float64(m)
+
+    @wp.func(module=module)
+    def axial_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, root: wp.int32, tip: wp.int32):
+        """Moment about the helix axis around joint e, of the mean over a turn, against the handedness of form 0."""
+        rest = model.polymorphs.rest_strain[2 * e]
+        half = wp.int32(half_turn / wp.length(rest))
+        moment = vec3(real(0.0))
+        along = vec3(real(0.0))
+        count = real(0.0)
+        j = wp.max(wp.min(e - half, tip - 2 * half), root)  # at the ends the first and the last whole turn
+        last = wp.min(wp.max(e + half, root + 2 * half), tip)
+        a = model.rod.bending_rigidity[k]
+        c = model.rod.twist_rigidity[k]
+        while j <= last:
+            t = chart.base.tangent[j]
+            u = chart.base.tangent[j + 1]
+            a1 = chart.base.director[j] + chart.base.director[j + 1]
+            a2 = wp.cross(t, chart.base.director[j]) + wp.cross(u, chart.base.director[j + 1])
+            d = strain_change(model, state, chart, j)
+            along += t + u
+            moment += real(0.5) * (a * d[0] * a1 + a * d[1] * a2 + c * d[2] * (t + u))
+            count += real(1.0)
+            j += 1
+        m = wp.abs(wp.dot(moment, wp.normalize(along))) / (count * model.rod.segment_length[k])
+        i = model.first_node[k]
+        hook = joint_strain(
+            chart.base.tangent[i], chart.base.tangent[i + 1], chart.base.director[i], chart.base.director[i + 1]
+        )
+        if hook[2] * rest[2] > real(0.0):
+            m = -m
+        return wp.float64(m)
+
+    @wp.kernel(module=module)
+    def flip(
+        # Model:
+        model: Model,
+        # State:
+        chart: Chart,
+        control: Control,
+        counted: wp.int32,
+        # Out:
+        state: State,
+    ):
+        """Flips joints of a flagellum at the end of an accepted step; `counted`: the clock stands there."""
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0 or chart.commit[c] == 0:
+            return
+        now = control.time[c]
+        if counted == 0:
+            now = advanced(control, c)
+        rest = now - model.polymorphs.ramp[k]  # what changed after this is on its ramp
+        root = first + 1
+        tip = model.first_node[k + 1] - 2
+        reach = 1 + wp.int32(real(end_length) / model.rod.segment_length[k])
+        nucleation = model.polymorphs.nucleation[k]
+        propagation = model.polymorphs.propagation[k]
+        before = int(2)  # form of the joint before, as it was; 2: on its ramp, or none
+        e = root
+        while e <= tip:
+            form = state.forms.form[e]
+            own = int(form)
+            if state.forms.changed[e] > rest:
+                own = 2
+            else:
+                after = int(2)
+                if e < tip and state.forms.changed[e + 1] <= rest:
+                    after = state.forms.form[e + 1]
+                ends = e - root < reach or tip - e < reach
+                led = before == 1 - form or after == 1 - form
+                over = bool(False)
+                if led:
+                    m = axial_moment(model, state, chart, e, k, root, tip)
+                    over = (form == 0 and m > propagation[0]) or (form == 1 and m < propagation[1])
+                elif ends and (e == root or before == form) and (e == tip or after == form):
+                    if form == 0:
+                        over = end_moment(model, state, chart, e, k) > nucleation[0]
+                    else:
+                        over = axial_moment(model, state, chart, e, k, root, tip) < nucleation[1]
+                if over:
+                    state.forms.form[e] = 1 - form
+                    state.forms.changed[e] = now
+            before = own
+            e += 1
+
+    return SimpleNamespace(ground_states=ground_states, flip=flip)
+
+
+def ground_states(model: DeviceModel, state: DeviceState) -> None:
+    """Ground states of all joints at the time of the evaluation, where the elastic term looks for them."""
+    kernel = _kernels(model.precision).ground_states
+    wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
+
+
+def flip(model: DeviceModel, state: DeviceState, chart: Any, control: Any, counted: bool) -> None:
+    """Flips joints at the ends of accepted steps; a part of a pass, after the step is committed.
+
+    Args:
+        model, state, chart, control: of the batch.
+        counted: whether the step is in the clocks already.
+    """
+    if model.switches.has("polymorphs"):
+        inputs = [model.data, chart, control, int(counted), state.data]
+        wp.launch(_kernels(model.precision).flip, model.flagellum_count, inputs=inputs, device=model.device)
+
+
+POLYMORPHS = Term("polymorphs", launch=ground_states, functions=functions, timed=True, balanced=False)
