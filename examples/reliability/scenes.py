@@ -19,7 +19,6 @@ from warpflag.run.growth import growth, growth_words
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.run.summary import accuracy_kept
 from warpflag.scene import Scene, SceneError, load, with_values
-from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
 FINER = 30.0
 """Accuracy over that of the finer run."""
@@ -124,7 +123,7 @@ def looks(
 def asked(scene: Scene, time: float) -> float:
     """Node error that a scene's accuracy allows after a time [um]: in proportion to it, or of independent errors."""
     share = time / 1e-3
-    return (scene.numerics.accuracy or DEFAULT_ACCURACY) * max(share, share**0.5)
+    return scene.numerics.asked * max(share, share**0.5)
 
 
 def told(scene: Scene, sim: Simulation, states: list[CellState]) -> str:
@@ -159,7 +158,7 @@ def against_finer(
     states = seen[:: LOOKS // 2]
     if end and end != "cut off" and not seen:
         return found("stopped", end, seconds=seconds)
-    accuracy = (scene.numerics.accuracy or DEFAULT_ACCURACY) / FINER
+    accuracy = scene.numerics.asked / FINER
     own = {"numerics.accuracy": accuracy, "numerics.precision": "float64", "numerics.on_accuracy": "warn"}
     if reference:
         own["numerics.stepper"] = reference
