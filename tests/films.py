@@ -11,11 +11,11 @@ from tests.helpers import rotation
 from warpflag.model.geometry import initial_state
 from warpflag.record import Frame, Record
 from warpflag.record.recorder import Recorder
-from warpflag.scene import Scene, dumps, with_values
+from warpflag.scene import Scene, dumps, paper_scene, with_values
 
 FRAME_INTERVAL = 5e-5
 THREE = with_values(
-    Scene(name="three"),
+    paper_scene(name="three"),
     {
         "flagella.count": 3,
         "flagella.opening_angle": 50.0,

@@ -15,13 +15,13 @@ import numpy as np
 
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.run.simulation import CellState, Evaluation, Simulation
-from warpflag.scene import FlagellumSpec, Scene, with_values
+from warpflag.scene import FlagellumSpec, Scene, paper_scene, with_values
 
 
 def cell(values: Mapping[str, Any] | None = None, precision: str = "float64") -> Scene:
     """Two short flagella on a body, every term of the model acting, with other values by dotted key; RKC steps it."""
     common = {"flagella.length": 2.0, "numerics.precision": precision, "numerics.stepper": "rkc"}
-    return with_values(Scene(name="cell"), {**common, **(values or {})})
+    return with_values(paper_scene(name="cell"), {**common, **(values or {})})
 
 
 def touching_cell(

@@ -13,12 +13,14 @@ from warpflag_kernels.stepping import frame_slots
 
 from warpflag.record import Record
 from warpflag.run import run
-from warpflag.scene import Scene, with_values
+from warpflag.scene import Scene, paper_scene, with_values
 
 
 def small(values=None) -> Scene:
     """Two short flagella, eight frames."""
-    return with_values(Scene(name="small"), {"duration": 8e-5, "frames": 8, "flagella.length": 2.0, **(values or {})})
+    return with_values(
+        paper_scene(name="small"), {"duration": 8e-5, "frames": 8, "flagella.length": 2.0, **(values or {})}
+    )
 
 
 def executed(scene: Scene, directory: Path) -> Path:

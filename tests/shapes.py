@@ -11,7 +11,7 @@ from warpflag import observables
 from warpflag.record import RECORD_NAME, Frame
 from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter
-from warpflag.scene import Scene
+from warpflag.scene import paper_scene
 
 
 def helix(node_count, *, axis_offset=(0.0, 0.0, 0.0), phase=0.0, radius=0.22, pitch=2.14, h=0.2, handedness=-1):
@@ -59,7 +59,7 @@ class Zipping:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        self.scene = Scene(name="made-up")
+        self.scene = paper_scene(name="made-up")
         self.times = 5e-5 * np.arange(161)
         first_node = np.array([0, 31, 62])
         recorder = Recorder(directory / RECORD_NAME)

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from warpflag.record import Record
     from warpflag.record.recorder import Recorder
     from warpflag.run.simulation import NumericalError, Simulation
-    from warpflag.scene import Scene, SceneError, load, with_values
+    from warpflag.scene import Scene, SceneError, load, paper_scene, with_values
     from warpflag.scene.sections import (
         Body,
         External,
@@ -47,6 +47,7 @@ __all__ = [
     "Steric",
     "__version__",
     "load",
+    "paper_scene",
     "with_values",
 ]
 
@@ -71,6 +72,7 @@ _HOMES = {
     "Start": "scene.sections",
     "Steric": "scene.sections",
     "load": "scene",
+    "paper_scene": "scene",
     "with_values": "scene",
 }
 

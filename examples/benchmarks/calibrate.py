@@ -37,7 +37,7 @@ import numpy as np
 from warpflag import load
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import FlagellumOverride, Scene, dumps, with_values
+from warpflag.scene import FlagellumOverride, Scene, dumps, paper_scene, with_values
 
 EIGHT = Path(__file__).parents[1] / "eight_flagella.toml"
 KERNELS = "warpflag_kernels"
@@ -178,7 +178,7 @@ def cell(window: str, **numerics: Any) -> Scene:
     if WINDOWS[window].flagella == 8:
         return with_values(load(EIGHT), values)
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
-    return with_values(Scene(name="calibrate", flagellum=phases), values)
+    return with_values(paper_scene(name="calibrate", flagellum=phases), values)
 
 
 def shape(sim: Simulation) -> InitialState:

@@ -18,7 +18,7 @@ import numpy as np
 
 from warpflag import load
 from warpflag.run.simulation import Simulation
-from warpflag.scene import FlagellumOverride, Scene, with_values
+from warpflag.scene import FlagellumOverride, Scene, paper_scene, with_values
 
 ACCURACY = 1e-2  # [um per ms]
 EIGHT = Path(__file__).parents[1] / "eight_flagella.toml"
@@ -31,8 +31,8 @@ def crowd(count: int, accuracy: float) -> Scene:
         return with_values(load(EIGHT), values)
     if count == 2:
         phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
-        return with_values(Scene(name="crowd", flagellum=phases), values)
-    return with_values(Scene(name="crowd"), {"flagella.count": count, **values})
+        return with_values(paper_scene(name="crowd", flagellum=phases), values)
+    return with_values(paper_scene(name="crowd"), {"flagella.count": count, **values})
 
 
 def run(scene: Scene, milliseconds: int) -> tuple[np.ndarray, int, float]:

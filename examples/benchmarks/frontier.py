@@ -27,7 +27,7 @@ import numpy as np
 
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import Simulation
-from warpflag.scene import FlagellumOverride, Scene, dumps, with_values
+from warpflag.scene import FlagellumOverride, Scene, dumps, paper_scene, with_values
 
 DURATION = 1.0e-3
 WINDOWS = {"free": 20e-6, "contact": 5.5e-3}  # where they begin [s]
@@ -43,7 +43,7 @@ def scene(args: argparse.Namespace, **numerics: Any) -> Scene:
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
     values = {"flagella.segment_length": args.segment_length, "duration": 1.0}
     values |= {f"numerics.{key}": value for key, value in numerics.items()}
-    return with_values(Scene(name="frontier", flagellum=phases), values)
+    return with_values(paper_scene(name="frontier", flagellum=phases), values)
 
 
 def shape(sim: Simulation) -> InitialState:

@@ -19,7 +19,7 @@ import numpy as np
 
 from warpflag.observables import closest_parameters, power_balance
 from warpflag.run.simulation import CellState, Simulation
-from warpflag.scene import FlagellumOverride, Scene, with_values
+from warpflag.scene import FlagellumOverride, Scene, paper_scene, with_values
 
 BEGIN = 2e-5  # of the balance, when the filaments are wound up [s]
 
@@ -54,7 +54,7 @@ def steric_energy(scene: Scene, state: CellState, first_node: np.ndarray) -> flo
 def balance(values: dict[str, Any], duration: float, interval: float) -> tuple[float, float, float, int]:
     """Motor work, dissipation, gain of energy [pN um] from BEGIN to the end, and steps taken."""
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
-    scene = with_values(Scene(name="balance", flagellum=phases), {"duration": 1.0, **values})
+    scene = with_values(paper_scene(name="balance", flagellum=phases), {"duration": 1.0, **values})
     sim = Simulation(scene, device="cpu")
     torques = np.array([spec.torque for spec in scene.resolved_flagella()])
     dissipated, ends = [], []

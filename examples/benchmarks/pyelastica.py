@@ -38,7 +38,7 @@ from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.model.geometry import initial_state
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, with_values
+from warpflag.scene import Scene, paper_scene, with_values
 
 try:
     import elastica
@@ -68,7 +68,7 @@ def scene(filaments: int, stepper: str = "implicit") -> Scene:
     if filaments == 2:
         values |= {"flagella.opening_angle": 0.0, "flagellum.0.azimuth": 0.0}
         values["flagellum.1.azimuth"] = 2 * math.degrees(math.asin(0.042 / 0.8))
-    return with_values(Scene(name="filaments", duration=1.0), values)
+    return with_values(paper_scene(name="filaments", duration=1.0), values)
 
 
 class Rods(elastica.BaseSystemCollection, elastica.Damping, elastica.Contact, elastica.Forcing):

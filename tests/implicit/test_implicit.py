@@ -18,7 +18,7 @@ from tests.helpers import as_start, attachment, cell, free_nodes, placed, touchi
 from tests.oracles import energy
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import CellState, NumericalError, Simulation
-from warpflag.scene import FlagellumOverride, Scene, with_values
+from warpflag.scene import FlagellumOverride, Scene, paper_scene, with_values
 
 # Node error over the accuracy's share of the time; in both precisions.
 SHARE = 5.0
@@ -38,7 +38,7 @@ def implicit(step: float | None = None, accuracy: float = ACCURACY) -> dict[str,
 
 def zipping(values: dict[str, Any]) -> Scene:
     phases = (FlagellumOverride(phase=180.0), FlagellumOverride(phase=280.0))
-    return with_values(Scene(name="zipping", flagellum=phases), values)
+    return with_values(paper_scene(name="zipping", flagellum=phases), values)
 
 
 def advanced(scene: Scene, start: InitialState | None, duration: float, device: str) -> Simulation:

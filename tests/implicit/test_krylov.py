@@ -9,7 +9,7 @@ from warpflag_kernels.implicit import krylov, stability
 from tests.bench import bench, close, dense_solver, displacements, spins
 from tests.bench import flat as flattened
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 
 # Of a solution, relative to its largest value: what six products leave, and round-off.
 TOLERANCE = {"float64": 2e-3, "float32": 1e-2}
@@ -64,7 +64,7 @@ def test_stiff_cells_keep_their_accuracy_in_long_steps(name, device):
     values, factor = FAMILY[name]
     stiff = {"flagella.bending_rigidity": 3.5 * factor, "flagella.twist_rigidity": 3.5 * factor}
     stiff["flagella.stretching_stiffness"] = min(1e7, 1e3 * factor)
-    scene, duration, accuracy = with_values(Scene(name="stiff"), {**stiff, **values}), 2e-4, 5e-3
+    scene, duration, accuracy = with_values(paper_scene(name="stiff"), {**stiff, **values}), 2e-4, 5e-3
     ends = []
     for stepper, asked in (("rkc", 2e-4), ("implicit", accuracy)):
         sim = Simulation(with_values(scene, {"numerics.stepper": stepper, "numerics.accuracy": asked}), device=device)
@@ -77,7 +77,7 @@ def test_stiff_cells_keep_their_accuracy_in_long_steps(name, device):
 
 
 def test_a_flexible_cell_needs_no_krylov_space(device):
-    sim = Simulation(Scene(name="flexible"), device=device)
+    sim = Simulation(paper_scene(name="flexible"), device=device)
     sim.advance(1e-4)
     assert 1.0 < sim.stepper.stability.kappa.numpy()[0] < stability.LARGE_KAPPA
     assert not sim.stepper.stability.strong.numpy().any()
@@ -85,7 +85,7 @@ def test_a_flexible_cell_needs_no_krylov_space(device):
 
 def test_a_stiff_cell_goes_on_with_the_same_bits(device):
     stiff, _ = FAMILY["held"]
-    scene = with_values(Scene(name="stiff"), {**stiff, **STIFF})
+    scene = with_values(paper_scene(name="stiff"), {**stiff, **STIFF})
     whole, parts = (Simulation(scene, device=device, strict=True) for _ in range(2))
     whole.advance(5e-5)
     kept = whole.checkpoint()
@@ -97,7 +97,7 @@ def test_a_stiff_cell_goes_on_with_the_same_bits(device):
 
 
 def test_cells_of_a_batch_decide_each_for_itself(device):
-    scenes = [with_values(Scene(name="cell"), values) for values in ({}, STIFFER)]
+    scenes = [with_values(paper_scene(name="cell"), values) for values in ({}, STIFFER)]
     batch = Simulation(scenes, device=device, strict=True)
     batch.advance(1e-4)
     assert batch.stepper.stability.strong.numpy().tolist() == [0, 1]

@@ -10,7 +10,7 @@ from tests.oracles import body_gaps, contact_distances
 from warpflag.model.geometry import initial_state
 from warpflag.model.start import starting_state
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, SceneError, with_values
+from warpflag.scene import Scene, SceneError, paper_scene, with_values
 
 SCENES = 40
 
@@ -29,7 +29,7 @@ def random_scene(index: int, phases: bool) -> Scene:
         }
         values |= {f"flagellum.{k}.tilt": float(random.uniform(0, 90))}
         values |= {f"flagellum.{k}.phase": float(random.uniform(0, 360))} if phases else {}
-    return with_values(Scene("random"), {**values, "steric.enabled": True})
+    return with_values(paper_scene("random"), {**values, "steric.enabled": True})
 
 
 @pytest.mark.parametrize("phases", [False, True], ids=["free phases", "given phases"])

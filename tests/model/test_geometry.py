@@ -13,15 +13,15 @@ import pytest
 
 from warpflag.model.geometry import ground_state, initial_state, phase_difference_at
 from warpflag.observables import phase_difference, turns_about_axis
-from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, load, with_values
+from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, load, paper_scene, with_values
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 NORMAL = (0.0, 1.3, -2.1)
 STRAINS = [NORMAL, (0.0, 1.3, 2.1), (0.7, -1.1, 1.9), (2.0, 0.0, -0.3), (1.0, 1.0, 0.0), (0.0, 0.0, 2.0), (0.0,) * 3]
 
 
-def paper_scene(opening_angle: float = 90.0, **flagella) -> Scene:
-    return Scene("test", flagella=Flagella(opening_angle=opening_angle, **flagella))
+def opened(opening_angle: float = 90.0, **flagella) -> Scene:
+    return paper_scene("test", flagella=Flagella(opening_angle=opening_angle, **flagella))
 
 
 def tangents(nodes: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ def test_ground_state_converges_to_the_continuum_helix_at_second_order():
 @pytest.mark.parametrize("strain", STRAINS)
 @pytest.mark.parametrize("segment_length", [0.05, 0.2, 1.0])
 def test_every_joint_has_exactly_the_intrinsic_strain(strain, segment_length):
-    scene = paper_scene(intrinsic_curvature=strain, segment_length=segment_length, length=6.0)
+    scene = opened(intrinsic_curvature=strain, segment_length=segment_length, length=6.0)
     state = initial_state(scene)
     for nodes, e1 in zip(state.positions, state.directors, strict=True):
         lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
@@ -97,7 +97,7 @@ def test_a_twist_of_pi_per_joint_is_refused():
 
 @pytest.mark.parametrize(("third", "sign"), [(-2.1, -1.0), (2.1, 1.0)])
 def test_handedness(third, sign):
-    scene = paper_scene(intrinsic_curvature=(0.0, 1.3, third))
+    scene = opened(intrinsic_curvature=(0.0, 1.3, third))
     axis = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
     nodes = initial_state(scene).positions[0]
     helix = ground_state((0.0, 1.3, third), 0.2)
@@ -112,7 +112,7 @@ def test_handedness(third, sign):
 @pytest.mark.parametrize(("azimuth", "tilt"), [(0.0, 45.0), (180.0, 11.5), (72.0, 60.0), (0.0, 0.0), (45.0, 140.0)])
 def test_helix_lies_about_the_axis_asked_for_at_the_phase_asked_for(azimuth, tilt, phase):
     own = FlagellumOverride(azimuth=azimuth, tilt=tilt, phase=phase, anchor_offset=-0.3)
-    scene = Scene("test", flagella=Flagella(count=1), flagellum=(own,))
+    scene = paper_scene("test", flagella=Flagella(count=1), flagellum=(own,))
     nodes = initial_state(scene).positions[0]
     helix = ground_state(NORMAL, 0.2)
     normal = np.array([math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth)), 0.0])
@@ -128,7 +128,7 @@ def test_helix_lies_about_the_axis_asked_for_at_the_phase_asked_for(azimuth, til
 
 
 def test_phase_of_an_axis_along_x_is_the_limit_of_tilted_axes():
-    nodes = [initial_state(paper_scene(opening_angle)).positions for opening_angle in (180.0, 180.0 - 1e-6)]
+    nodes = [initial_state(opened(opening_angle)).positions for opening_angle in (180.0, 180.0 - 1e-6)]
     for exact, near in zip(*nodes, strict=True):
         np.testing.assert_allclose(exact, near, atol=1e-6)
 
@@ -136,7 +136,7 @@ def test_phase_of_an_axis_along_x_is_the_limit_of_tilted_axes():
 def test_straight_rods_lie_along_their_axis_and_their_phase_turns_the_frame():
     def flagellum(phase):
         own = FlagellumOverride(tilt=30.0, phase=phase)
-        scene = Scene("test", flagella=Flagella(count=1, intrinsic_curvature=(0, 0, 0)), flagellum=(own,))
+        scene = paper_scene("test", flagella=Flagella(count=1, intrinsic_curvature=(0, 0, 0)), flagellum=(own,))
         state = initial_state(scene)
         return state.positions[0], state.directors[0]
 
@@ -185,7 +185,7 @@ def test_tripod_stands_on_the_motor_axis_without_twist(path):
 
 
 def test_a_motor_axis_against_the_first_segment_is_refused():
-    scene = with_values(paper_scene(0.0, intrinsic_curvature=(0, 0, 0)), {"motor.axis_angle": 180.0})
+    scene = with_values(opened(0.0, intrinsic_curvature=(0, 0, 0)), {"motor.axis_angle": 180.0})
     with pytest.raises(SceneError, match=r"motor\.axis_angle = 180\.0: .* flagellum 0"):
         initial_state(scene)
 
@@ -193,9 +193,9 @@ def test_a_motor_axis_against_the_first_segment_is_refused():
 def test_mirrored_flagella_are_the_mirror_image():
     """Reflection in the x-z plane turns psi and the third strain round and keeps e1."""
     phases = {"flagellum.0.phase": 50.0, "flagellum.1.phase": 200.0}
-    left = initial_state(with_values(paper_scene(44.0), phases))
+    left = initial_state(with_values(opened(44.0), phases))
     mirrored_phases = {key: -phase for key, phase in phases.items()}
-    right = initial_state(with_values(paper_scene(44.0, intrinsic_curvature=(0.0, 1.3, 2.1)), mirrored_phases))
+    right = initial_state(with_values(opened(44.0, intrinsic_curvature=(0.0, 1.3, 2.1)), mirrored_phases))
     for original, image in zip(left.positions + left.directors, right.positions + right.directors, strict=True):
         np.testing.assert_allclose(image, original * [1, -1, 1], atol=1e-14)
 
@@ -205,7 +205,7 @@ def test_mirrored_flagella_are_the_mirror_image():
     [(23, 6, 150, 0.80), (44, 6, 120, 0.60), (90, 6, 130, 0.59), (23, 8, 150, 0.80), (90, 8, 130, 0.61)],
 )
 def test_known_shifts_give_the_known_phase_differences(opening_angle, length, shift, theta):
-    scene = paper_scene(opening_angle, length=length)
+    scene = opened(opening_angle, length=length)
     assert round(phase_difference_at(scene, shift), 2) == theta
 
 
@@ -217,15 +217,15 @@ def test_phase_difference_is_reached_or_refused(opening_angle, lowest):
         return phase_difference(np.vstack(state.positions), np.vstack(state.directors), first_node)
 
     for wanted in (lowest + 0.01, 0.3, 0.59, 0.8, 1.0 - 1e-9):
-        scene = paper_scene(opening_angle, phase_difference=wanted)
+        scene = opened(opening_angle, phase_difference=wanted)
         assert measured(scene) == pytest.approx(wanted, abs=1e-10)
     # Without a wish both start at the same phase angle, where the least phase difference lies.
-    assert measured(paper_scene(opening_angle)) == pytest.approx(lowest, abs=6e-3)
+    assert measured(opened(opening_angle)) == pytest.approx(lowest, abs=6e-3)
     with pytest.raises(SceneError, match=r"flagella\.phase_difference = .*: these flagella reach") as caught:
-        initial_state(paper_scene(opening_angle, phase_difference=lowest - 0.01))
+        initial_state(opened(opening_angle, phase_difference=lowest - 0.01))
     reach = re.search(r"reach ([\d.]+) to ([\d.]+)", str(caught.value))
     assert reach and float(reach[1]) == pytest.approx(lowest, abs=6e-3) and float(reach[2]) > 0.999
-    initial_state(paper_scene(opening_angle, phase_difference=1.0))
+    initial_state(opened(opening_angle, phase_difference=1.0))
 
 
 def test_the_main_scene_starts_with_a_shift_of_130_degrees():
@@ -248,18 +248,18 @@ def test_phase_difference_turns_flagella_of_odd_number_by_at_most_180_degrees(sh
         return tuple(FlagellumOverride(azimuth=a, phase=p) for a, p in zip(azimuths, phases, strict=True))
 
     group = Flagella(count=4, opening_angle=44.0)
-    wanted = phase_difference_at(Scene("test", flagella=group, flagellum=own(None, None, 20.0, None)), shift)
+    wanted = phase_difference_at(paper_scene("test", flagella=group, flagellum=own(None, None, 20.0, None)), shift)
     wished = dataclasses.replace(group, phase_difference=wanted)
-    chosen = initial_state(Scene("test", flagella=wished, flagellum=own(None, None, 20.0, None)))
+    chosen = initial_state(paper_scene("test", flagella=wished, flagellum=own(None, None, 20.0, None)))
     phases = (180.0, 180.0 + shift, 20.0, 180.0 + shift)
-    expected = initial_state(Scene("test", flagella=group, flagellum=own(*phases)))
+    expected = initial_state(paper_scene("test", flagella=group, flagellum=own(*phases)))
     for found, nodes in zip(chosen.positions, expected.positions, strict=True):
         np.testing.assert_allclose(found, nodes, atol=1e-9)
 
 
 def test_flagella_of_unequal_length_can_be_shifted():
     own = (FlagellumOverride(), FlagellumOverride(length=4.0))
-    scene = Scene("test", flagella=Flagella(opening_angle=23.0, phase_difference=0.7), flagellum=own)
+    scene = paper_scene("test", flagella=Flagella(opening_angle=23.0, phase_difference=0.7), flagellum=own)
     state = initial_state(scene)
     assert [len(nodes) for nodes in state.positions] == [31, 21]
     first_node = np.array([0, 31, 52])
@@ -275,7 +275,7 @@ def test_on_its_axis_a_flagellum_starts_there_and_ends_as_the_helix(h):
         "flagella.count": 1,
         "flagella.opening_angle": 50.0,
     }
-    scene = with_values(paper_scene(), values)
+    scene = with_values(opened(), values)
     nodes, e1 = initial_state(scene).positions[0], initial_state(scene).directors[0][1:]
     edges = np.diff(nodes, axis=0)
     assert np.linalg.norm(edges, axis=1) == pytest.approx(h, rel=1e-12)
@@ -292,7 +292,7 @@ def test_on_its_axis_a_flagellum_starts_there_and_ends_as_the_helix(h):
 
 @pytest.mark.parametrize("offset", [1.25, 1.1, -0.9])
 def test_anchors_may_lie_on_the_caps(offset):
-    scene = with_values(paper_scene(), {"flagella.count": 1, "flagella.anchor_offset": offset})
+    scene = with_values(opened(), {"flagella.count": 1, "flagella.anchor_offset": offset})
     anchor = initial_state(scene).positions[0][0]
     centre = np.array([0.0, 0.0, math.copysign(0.85, offset)])
     assert anchor[2] == pytest.approx(offset)

@@ -16,7 +16,7 @@ from warpflag.observables import recorded
 from warpflag.record import Record
 from warpflag.record.recorder import Recorder
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 
 TURN = rotation([0.4, -1.0, 0.3])
 
@@ -29,7 +29,7 @@ def arrays(start):
 
 
 def test_strain_of_the_ground_state_is_the_intrinsic_one():
-    scene = Scene(name="rest")
+    scene = paper_scene(name="rest")
     start = initial_state(scene)
     for nodes, directors in zip(start.positions, start.directors, strict=True):
         omega = observables.strain(observables.segment_tangents(nodes), directors[1:], 0.2)
@@ -52,7 +52,7 @@ def test_strain_of_a_ring_is_its_curvature_and_of_a_spun_line_its_twist():
 
 def test_elastic_energy_by_term():
     """At rest none; stretched by 1 % K L/2 1e-4; the hook twisted by 0.2 rad 3 C/(2 h) 0.04; spun joint by joint."""
-    scene = Scene(name="rest")
+    scene = paper_scene(name="rest")
     positions, directors = arrays(initial_state(scene))
     axes, first_node = observables.motor_axes(scene), np.array([0, 31, 62])
 
@@ -132,7 +132,7 @@ def test_helix_rate_of_less_than_a_turn_and_of_a_line():
 
 def test_motor_axes_and_lab_rate():
     scene = with_values(
-        Scene(name="m"), {"motor.axis_angle": 30.0, "flagellum.1.azimuth": 90.0, "flagellum.0.tilt": 5.0}
+        paper_scene(name="m"), {"motor.axis_angle": 30.0, "flagellum.1.azimuth": 90.0, "flagellum.0.tilt": 5.0}
     )
     axes = observables.motor_axes(scene)
     half, tall = 0.5, math.sqrt(3) / 2
@@ -146,7 +146,7 @@ def test_motor_axes_and_lab_rate():
 
 def test_body_power_is_that_of_its_drag_along_and_across():
     """Swimming at 45 degrees to its axis while it tumbles: along 0.010775, across 0.013343, tumble 1.2373e-2."""
-    scene, times = Scene(name="b"), np.linspace(0.0, 1e-4, 11)
+    scene, times = paper_scene(name="b"), np.linspace(0.0, 1e-4, 11)
     angle = 100.0 * times  # rad, about x: the axis turns by 0.01 in all
     orientations = np.stack([np.sin(angle / 2), 0 * angle, 0 * angle, np.cos(angle / 2)], axis=-1)
     path = np.outer(times, [200.0, 0.0, 200.0])
@@ -155,7 +155,7 @@ def test_body_power_is_that_of_its_drag_along_and_across():
 
 
 def test_thrust_on_a_sphere_is_stokes_drag():
-    sphere = with_values(Scene(name="s"), {"body.length": 2.0, "body.width": 2.0, "flagella.anchor_offset": 0.0})
+    sphere = with_values(paper_scene(name="s"), {"body.length": 2.0, "body.width": 2.0, "flagella.anchor_offset": 0.0})
     assert observables.thrust(25.0, sphere) == pytest.approx(6 * math.pi * 1e-3 * 1.0 * 25.0)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, sections, with_values
+from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, paper_scene, sections, with_values
 from warpflag.scene.settings import Section
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
@@ -194,7 +194,7 @@ def test_bounds_are_inclusive_and_hold(cls, name):
 )
 def test_extremes_that_a_stability_study_needs_are_allowed(key, value):
     section, _, name = key.partition(".")
-    assert getattr(getattr(with_values(Scene("a"), {key: value}), section), name) == value
+    assert getattr(getattr(with_values(paper_scene("a"), {key: value}), section), name) == value
 
 
 @pytest.mark.parametrize(("cls", "name"), SETTINGS)
@@ -206,7 +206,7 @@ def test_docstrings_tell_every_setting(cls, name):
 
 def test_defaults_are_the_papers(tmp_path):
     scene = scene_from(tmp_path, "")
-    assert scene == Scene("cell")
+    assert scene == paper_scene("cell")
     assert (scene.flagella.bending_rigidity, scene.flagella.twist_rigidity) == (3.5, 3.5)
     assert scene.flagella.intrinsic_curvature == (0.0, 1.3, -2.1)
     assert (scene.flagella.stretching_stiffness, scene.flagella.hook_twist_factor) == (1000.0, 3.0)
@@ -306,7 +306,7 @@ def test_with_values_checks_and_leaves_the_original(tmp_path):
 
 
 def test_a_written_scene_reads_back_equal(tmp_path):
-    scene = Scene(
+    scene = paper_scene(
         "all the settings",
         flagella=sections.Flagella(count=3, length=math.pi, segment_length=0.1, phase_difference=None),
         flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(60.1)),
@@ -330,7 +330,7 @@ def test_examples_load_and_read_back_equal(tmp_path, path):
 
 @pytest.mark.parametrize(("cls", "name"), [case for case in SETTINGS if case[0] is not FlagellumOverride])
 def test_every_setting_is_written(cls, name):
-    line = next(line for line in dumps(Scene("a")).splitlines() if line.lstrip("# ").startswith(f"{name} ="))
+    line = next(line for line in dumps(paper_scene("a")).splitlines() if line.lstrip("# ").startswith(f"{name} ="))
     absent = line.startswith("#")
     assert absent == (cls is not Scene and getattr(cls(), name) is None)
     assert "absent: " in line or not absent

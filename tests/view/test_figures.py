@@ -12,7 +12,7 @@ from tests.runs import executed, small
 from tests.shapes import Zipping
 from warpflag import cli
 from warpflag.base.output import OutputError
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 from warpflag.view.coloring import FLAGELLUM_COLORS, linear
 from warpflag.view.labels import labels_of
 
@@ -132,7 +132,7 @@ def test_a_short_peak_does_not_flatten_the_rest_and_is_told(tmp_path):
     ],
 )
 def test_runs_are_labelled_by_what_differs(changes, expected):
-    assert labels_of([with_values(Scene(name="s"), values) for values in changes]) == expected
+    assert labels_of([with_values(paper_scene(name="s"), values) for values in changes]) == expected
 
 
 def test_a_figure_displays_itself_in_a_notebook(made):

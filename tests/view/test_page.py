@@ -16,7 +16,7 @@ import pytest
 from tests.films import FIRST_NODE, THREE, made_record
 from warpflag import cli
 from warpflag.base.output import OutputError
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 from warpflag.view.coloring import Coloring
 from warpflag.view.page import page_of, write_page
 
@@ -74,7 +74,7 @@ def test_the_page_has_the_movie_s_colours(record, name):
 
 
 def test_three_hundred_frames_stay_below_three_megabytes(tmp_path):
-    with made_record(tmp_path, 301, scene=Scene(name="two")) as record:
+    with made_record(tmp_path, 301, scene=paper_scene(name="two")) as record:
         page = page_of(record)
         assert len(page.encode()) < 3e6
         # A notebook leaves frames out evenly, and says so.
@@ -92,7 +92,7 @@ def test_what_can_t_be_shown_is_told(record, tmp_path):
 
 
 def test_a_scene_s_text_can_not_break_the_page(tmp_path):
-    scene = with_values(Scene(name="sly"), {"start.record": "</script><script>alert(1)</script>"})
+    scene = with_values(paper_scene(name="sly"), {"start.record": "</script><script>alert(1)</script>"})
     with made_record(tmp_path, 2, scene=scene) as record:
         page = page_of(record)
     assert page.count("</script>") == 3
@@ -337,7 +337,7 @@ def test_command_writes_the_page(record, tmp_path, capsys, monkeypatch):
 
 
 def test_one_flagellum_has_no_bundle(tmp_path):
-    with made_record(tmp_path, 3, scene=with_values(Scene(name="one"), {"flagella.count": 1})) as record:
+    with made_record(tmp_path, 3, scene=with_values(paper_scene(name="one"), {"flagella.count": 1})) as record:
         shown = content_of(page_of(record))
     assert "phase_difference" not in shown["colorings"]
     assert [curve["label"] for curve in shown["curves"]] == ["motor rate (Hz)"]

@@ -12,7 +12,7 @@ from tests.shapes import Zipping
 from warpflag.base.output import OutputError
 from warpflag.record.recorder import Recorder
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Flagella, Scene
+from warpflag.scene import Flagella, paper_scene
 from warpflag.view import figures
 
 pytest.importorskip("matplotlib")
@@ -88,7 +88,7 @@ def test_snapshots_follow_the_body_and_show_what_is_in_front(made):
 
 
 def test_one_flagellum_has_no_bundle_to_plot(tmp_path):
-    scene = Scene(name="one", duration=2e-5, frames=2, flagella=Flagella(count=1, length=1.0))
+    scene = paper_scene(name="one", duration=2e-5, frames=2, flagella=Flagella(count=1, length=1.0))
     Simulation(scene, device="cpu", reporters=[Recorder(tmp_path / "run.h5")]).run()
     with pytest.raises(OutputError, match="one flagellum"):
         insets.curves_of(tmp_path, "one")

@@ -113,7 +113,7 @@ class Member:
             "time": time,
             "wall_time": self.wall_time,
             "device": device,
-            "dynamics_sha256": dynamics_sha256(self.scene),
+            "motion_sha256": dynamics_sha256(self.scene),
             "versions": versions(),
         }
         self.recorder.flush()

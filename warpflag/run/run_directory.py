@@ -25,6 +25,7 @@ __all__ = [
     "dynamics_sha256",
     "recorded_scene",
     "sync",
+    "text_sha256",
     "write_whole",
 ]
 
@@ -96,11 +97,17 @@ def sync(path: Path) -> None:
 
 def dynamics_sha256(scene: Scene) -> str:
     """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion."""
-    return hashlib.sha256(_dynamics(scene).encode()).hexdigest()
+    values = re.sub(r" *#.*", "", _dynamics(dumps(scene)))  # what a comment says may change from version to version
+    return hashlib.sha256(values.encode()).hexdigest()
 
 
-def _dynamics(scene: Scene) -> str:
-    return re.sub(r"^(duration|frames|behaviour) = .*\n", "", dumps(scene), flags=re.MULTILINE)
+def text_sha256(text: str) -> str:
+    """The same of a scene's text as it is, comments and all."""
+    return hashlib.sha256(_dynamics(text).encode()).hexdigest()
+
+
+def _dynamics(text: str) -> str:
+    return re.sub(r"^(duration|frames|behaviour) = .*\n", "", text, flags=re.MULTILINE)
 
 
 def recorded_scene(directory: Path, prolonged: bool) -> Scene:
@@ -129,7 +136,8 @@ def recorded_scene(directory: Path, prolonged: bool) -> Scene:
         recorded = loads(text)
     except SceneError as error:
         raise RunError(f"--resume {directory}: {RECORD_NAME}: its scene can't be read: {error}") from None
-    different = _dynamics(recorded) != _dynamics(scene) if prolonged else dumps(recorded) != dumps(scene)
+    texts = dumps(recorded), dumps(scene)
+    different = _dynamics(texts[0]) != _dynamics(texts[1]) if prolonged else texts[0] != texts[1]
     if different:
         difference = _difference(recorded, scene)
         problem = f"{SCENE_NAME} is not the scene of {RECORD_NAME}: {difference}; only --set duration=... may change"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from warpflag.scene import scene_file
-from warpflag.scene.errors import Problems, SceneError, written
+from warpflag.scene.errors import Problems, SceneError, shown, written
+from warpflag.scene.formats import BEFORE_FORMATS
 from warpflag.scene.scene import Scene
 from warpflag.scene.sections import (
     Body,
@@ -57,9 +59,12 @@ def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) ->
         raise (error if error.source else error.located(path)) from None
     values.setdefault("name", re.sub(r"[^\w.+-]+", "-", Path(path).stem).strip("-.+") or "scene")
     try:
-        return _built({**values, **given}, tables)
+        scene = _built({**_of_format(values), **given}, tables)
     except SceneError as error:
         raise error.located(path, given) from None
+    if "format" not in values:
+        _tell_format(path, values)
+    return scene
 
 
 def loads(toml: str) -> Scene:
@@ -68,7 +73,8 @@ def loads(toml: str) -> Scene:
     Raises:
         SceneError: the scene can't be simulated.
     """
-    return _built(*scene_file.flattened(scene_file.parsed(toml), _SECTIONS))
+    values, tables = scene_file.flattened(scene_file.parsed(toml), _SECTIONS)
+    return _built(_of_format(values), tables)
 
 
 def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
@@ -109,6 +115,23 @@ def flagellum_example() -> str:
     lines = scene_file.section_lines(FlagellumOverride())
     head = "# One table for each flagellum, or none; --set flagellum.0.torque=1.5 sets a value of a single one."
     return "\n".join([head, "# [[flagellum]]", *lines]) + "\n"
+
+
+def _of_format(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The values of a file, with those that a file without a format has where it leaves them out."""
+    return values if "format" in values else {**BEFORE_FORMATS, **values}
+
+
+_told: set[str] = set()  # files without a format that were told of
+
+
+def _tell_format(path: str | Path, values: Mapping[str, Any]) -> None:
+    """Says once of a file without a format which values it has that a new one has not."""
+    left_out = [f"{key} = {shown(value)}" for key, value in BEFORE_FORMATS.items() if key not in values]
+    if left_out and str(path) not in _told:
+        _told.add(str(path))
+        said = f"has no format, so it has {', '.join(left_out)}; format = 1 converges"
+        print(f"warpflag: {path}: {said}", file=sys.stderr)
 
 
 def _built(values: Mapping[str, Any], tables: int) -> Scene:

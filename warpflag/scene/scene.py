@@ -102,6 +102,7 @@ class Scene(Section, key=""):
     external: External = dataclasses.field(default_factory=External)
     numerics: Numerics = dataclasses.field(default_factory=Numerics)
     start: Start = dataclasses.field(default_factory=Start)
+    format: int = integer(1, 1, 1, "which defaults the file has; without it those of the paper's model")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -2,7 +2,8 @@
 
 Units are um, pN and s throughout (so pN um for torques, pN s/um^2 for viscosity); angles are in degrees.
 Defaults are those of Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015), "the paper", wherever it prints a
-value; where it prints none, the class says where the value comes from.
+value, but for hydrodynamics and hook, where they are those of a model that converges with the segment length; where it
+prints none, the class says where the value comes from.
 
 Body axes: e_b3 is the long axis and points to the rear, e_b1 is where azimuths are counted from.
 """
@@ -165,9 +166,9 @@ class Hook(Section, key="hook"):
     m and the axis of the helix at rest, which is fixed in the first segment.
     """
 
-    length: float = number(0.0, "um", 0, 1, "of the stub; the flagellum begins at its end", usual=(1e-3, 1.0))
+    length: float = number(0.055, "um", 0, 1, "of the stub; the flagellum begins at its end", usual=(1e-3, 1.0))
     stiffness: float = number(
-        0.0, "pN um/rad", 0, 1e4, "of bending; EI over the length: 0.65 relaxed, 4 loaded, 0 as in the paper"
+        0.65, "pN um/rad", 0, 1e4, "of bending; EI over the length: 0.65 relaxed, 4 loaded, 0 as in the paper"
     )
     stiffening_torque: float | None = number(
         None,
@@ -239,7 +240,9 @@ class Hydrodynamics(Section, key="hydrodynamics"):
     not count a filament's own flow twice and converges with the segment length.
     """
 
-    mode: str = choice("all", ("none", "within", "between", "all", "as_printed", "consistent"), "pairs that are summed")
+    mode: str = choice(
+        "consistent", ("none", "within", "between", "all", "as_printed", "consistent"), "pairs that are summed"
+    )
     pair_radius: float | None = number(
         None,
         "um",

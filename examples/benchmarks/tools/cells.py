@@ -9,7 +9,7 @@ import numpy as np
 
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Body, Flagella, FlagellumOverride, Scene, with_values
+from warpflag.scene import Body, Flagella, FlagellumOverride, Scene, paper_scene, with_values
 
 SEGMENT = 0.2  # um, that of the zipping scene
 GOLDEN_ANGLE = 180.0 * (3.0 - math.sqrt(5.0))  # deg; turned by it, no two flagella come to lie in one row
@@ -36,7 +36,7 @@ def spread(count: int, segments: int, precision: str = "float64", **values: Any)
         )
         for k, x in enumerate(along)
     )
-    scene = Scene(name=f"spread-{count}", body=body, flagella=Flagella(count=count), flagellum=flagella)
+    scene = paper_scene(name=f"spread-{count}", body=body, flagella=Flagella(count=count), flagellum=flagella)
     given = {key.replace("__", "."): value for key, value in values.items()}
     return with_values(scene, {"numerics.precision": precision, "numerics.stepper": "rkc", **given})
 

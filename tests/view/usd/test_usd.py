@@ -10,7 +10,7 @@ from pxr import Gf, Usd, UsdGeom, UsdShade  # noqa: TID253 (no command line star
 
 from tests.films import FIRST_NODE, FRAME_INTERVAL, THREE, made_record, motor_axes
 from tests.view.usd.stages import at, faults
-from warpflag.scene import Scene, load, with_values
+from warpflag.scene import load, paper_scene, with_values
 from warpflag.view.coloring import QUANTITIES, Coloring
 from warpflag.view.node_quantities import curvature
 from warpflag.view.usd import Shot, movie_stage, write_movie
@@ -198,6 +198,6 @@ def test_colours_follow_the_values(movie):
 
 @pytest.mark.parametrize("count", [1, 9])
 def test_any_number_of_flagella(tmp_path, count):
-    record = made_record(tmp_path, 3, scene=with_values(Scene(name="n"), {"flagella.count": count}))
+    record = made_record(tmp_path, 3, scene=with_values(paper_scene(name="n"), {"flagella.count": count}))
     for color_by in QUANTITIES:
         assert faults(movie_stage(record, Shot(color_by=color_by))) == []

@@ -8,7 +8,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux  # noqa: TID253 (no command line starts
 
 from tests.films import made_record
 from tests.view.usd.stages import at, faults
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 from warpflag.view.usd import Shot, movie_stage, write_movie
 from warpflag.view.usd.camera import steady_path
 
@@ -100,7 +100,7 @@ def test_any_number_of_frames_anywhere(tmp_path, frame_count):
 
 
 def test_several_cells_stand_side_by_side(tmp_path):
-    two = with_values(Scene(name="two"), {"flagella.length": 4.0})
+    two = with_values(paper_scene(name="two"), {"flagella.length": 4.0})
     records = [
         made_record(tmp_path / "a", 12),
         made_record(tmp_path / "b", 5, scene=two),
