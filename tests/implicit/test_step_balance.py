@@ -8,7 +8,7 @@ from warpflag_kernels.stepping.health import Fault
 
 from tests.helpers import cell, touching_cell
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 
 # Of energy and work, relative: float32 has seven digits, and differences of positions of some um.
 TOLERANCE = {"float64": 1e-9, "float32": 2e-3}
@@ -68,7 +68,7 @@ def test_an_unstable_stepper_is_seen_within_microseconds(device, precision):
         "body.anchored": True,
         "numerics.precision": precision,
     }
-    sound, sick = (Simulation(with_values(Scene(name="stiff"), stiff), device=device) for _ in range(2))
+    sound, sick = (Simulation(with_values(paper_scene(name="stiff"), stiff), device=device) for _ in range(2))
     sound.advance(1e-5)
     assert sums(sound, "refused") == 0
     sick.stepper.stability = None

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, paper_scene, sections, with_values
+from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, loads, paper_scene, sections, with_values
 from warpflag.scene.settings import Section
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
@@ -352,3 +352,21 @@ def test_a_scene_needs_the_standard_library_only():
     code = "import sys, warpflag.scene; print(sorted({'numpy', 'warp', 'h5py', 'pxr'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_file_without_a_format_has_the_paper_s_model_and_says_so_once(tmp_path, capsys):
+    old, new = tmp_path / "old.toml", tmp_path / "new.toml"
+    old.write_text('name = "x"\n')
+    new.write_text('format = 1\nname = "x"\n')
+    for _ in range(2):
+        scene = load(old)
+    assert scene == paper_scene("x")
+    assert (scene.hydrodynamics.mode, scene.hook.length, scene.hook.stiffness) == ("all", 0.0, 0.0)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(old) in line and "format = 1" in line and 'hydrodynamics.mode = "all"' in line
+    assert load(new) == Scene("x")
+    assert load(old, {"hook.length": 0.1}).hook.length == 0.1
+    # As resolved, both are of the newest format, and stay what they are.
+    for made in (scene, Scene("x")):
+        assert "\nformat = 1 " in dumps(made) and loads(dumps(made)) == made
+    assert capsys.readouterr().err == ""

@@ -12,7 +12,7 @@ from tests.runs import executed, small, summary
 from warpflag.run import run
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.run.summary import accuracy_kept, kept_words
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 
 # Of the sums, relative: the device adds the same numbers in float64 in another order of operations.
 TOLERANCE = 1e-9
@@ -131,7 +131,7 @@ def test_a_summary_says_what_was_kept(stepper, tmp_path):
 def test_thin_fluids_may_have_shorter_steps():
     """Ten times as thin, everything is ten times as fast."""
     shortest = [
-        Simulation(with_values(Scene(name="x"), {"fluid.viscosity": eta}), device="cpu").stepper.steps.shortest.numpy()
+        Simulation(with_values(paper_scene("x"), {"fluid.viscosity": eta}), device="cpu").stepper.steps.shortest.numpy()
         for eta in (1e-3, 1e-4, 1e-2)
     ]
     np.testing.assert_allclose(np.concatenate(shortest), SHORTEST_STEP * np.array([1.0, 0.1, 1.0]))
