@@ -176,7 +176,7 @@ def switches_of(scene: Scene) -> Switches:
     numerics, segments = scene.numerics, sum(spec.segment_count for spec in scene.resolved_flagella())
     unequal = pairs != "none" and len(set(pair_radii(scene))) > 1
     return Switches(
-        flows=Flows(pairs, unequal=unequal, body=scene.hydrodynamics.body_flow),
+        flows=Flows(pairs, unequal=unequal, body=scene.has_body_flow),
         terms=tuple(term.name for term in SCENE_TERMS if term.needed(scene)),
         short_pairs=pairs != "none" and numerics.short_pairs(segments),
         noise=scene.fluid.temperature > 0.0,

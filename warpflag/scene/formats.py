@@ -14,7 +14,12 @@ from warpflag.scene.sections import Hook, Hydrodynamics
 
 __all__ = ["BEFORE_FORMATS", "paper_scene"]
 
-BEFORE_FORMATS: dict[str, Any] = {"hydrodynamics.mode": "all", "hook.length": 0.0, "hook.stiffness": 0.0}
+BEFORE_FORMATS: dict[str, Any] = {
+    "hydrodynamics.mode": "all",
+    "hydrodynamics.body_flow": False,
+    "hook.length": 0.0,
+    "hook.stiffness": 0.0,
+}
 """The paper's model, by dotted key: the values of these settings in a file that has no format and leaves them out."""
 
 _SECTIONS = {"hydrodynamics": Hydrodynamics, "hook": Hook}

@@ -169,6 +169,13 @@ class Scene(Section, key=""):
             problem = f"must not be above duration = {self.duration:g} s"
             raise SceneError("numerics.time_step", step, problem, ["duration"])
 
+    @property
+    def has_body_flow(self) -> bool:
+        """Whether the flow round the body is part of the model: as the scene says, else wherever it can be."""
+        if self.hydrodynamics.body_flow is not None:
+            return self.hydrodynamics.body_flow
+        return self.hydrodynamics.mode in ("all", "consistent") and self.body.enabled and not self.fluid.temperature
+
     def _check_flows(self) -> None:
         radius, mode = self.hydrodynamics.pair_radius, self.hydrodynamics.mode
         if radius is not None and mode in ("none", "as_printed"):

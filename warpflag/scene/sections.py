@@ -253,8 +253,10 @@ class Hydrodynamics(Section, key="hydrodynamics"):
         "that is max(filament_radius, drag_perpendicular h / (6 pi viscosity)) unless consistent, h that of the "
         "segment, the longest one unless consistent",
     )
-    body_flow: bool = switch(
-        False, "the body's surface obstructs the flow of the flagella and carries fluid along; with all and consistent"
+    body_flow: bool | None = switch(
+        None,
+        "the body's surface obstructs the flow of the flagella and carries fluid along; with all and consistent",
+        derived="true where it can be: with all and consistent, a body, and no temperature",
     )
     body_beads: int = integer(
         60, 20, 2000, "beads of the body's surface with body_flow; the more, the better the flow beside the body"

@@ -166,9 +166,9 @@ def numbers(default: tuple[float, ...] | None, unit: str, low: float, high: floa
     return _declared(default, Setting("numbers", meaning, unit, low, high, **more))
 
 
-def switch(default: bool, meaning: str) -> Any:
-    """Declares a field that holds true or false."""
-    return _declared(default, Setting("switch", meaning))
+def switch(default: bool | None, meaning: str, **more: Any) -> Any:
+    """Declares a field that holds true or false; `more` as in Setting."""
+    return _declared(default, Setting("switch", meaning, **more))
 
 
 def choice(default: str | None, choices: tuple[str, ...], meaning: str, **more: Any) -> Any:

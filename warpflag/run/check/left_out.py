@@ -54,7 +54,7 @@ def thermal_noise(scene: Scene, stiff: Turning) -> str | None:
 
 def body_flow(scene: Scene, stiff: Turning) -> str | None:
     """Flow of the body's drag, a Stokeslet on its axis, mean over the flagellum."""
-    if not _has_body(scene) or _has(scene, "hydrodynamics.body_flow"):
+    if not _has_body(scene) or scene.has_body_flow:
         return None
     eta, body = scene.fluid.viscosity, scene.body
     sphere = 1 / (6 * math.pi * eta * spheroid_mobility(body.length, body.width, eta).along)

@@ -120,8 +120,8 @@ def _switched(scene: Scene, standard: dict[str, Any]) -> list[Choice]:
         found.append(Choice("no hook", "model", {**standard, **hook}, turn=3))
     else:
         found.append(Choice("hook 0.055 um", "model", {**standard, "hook.length": 0.055}, turn=3))
-    if "body_flow" in scene.hydrodynamics.settings:
-        on = not getattr(scene.hydrodynamics, "body_flow")  # noqa: B009
+    if scene.has_body_flow or with_values(scene, {"hydrodynamics.body_flow": None}).has_body_flow:
+        on = not scene.has_body_flow
         name = "body flow" if on else "no body flow"
         found.append(Choice(name, "model", {**standard, "hydrodynamics.body_flow": on}, turn=3))
     if scene.steric.enabled and len(scene.resolved_flagella()) > 1:
