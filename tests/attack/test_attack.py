@@ -12,7 +12,7 @@ import pytest
 
 from examples.reliability import attack, extremes, scenes
 from examples.reliability.attempt import OUTCOMES, problem
-from warpflag.scene import Scene, with_values
+from warpflag.scene import paper_scene, with_values
 
 ROOT = Path(__file__).parent.parent.parent
 COUNTS = {"kills": 3, "limits": 2, "damage": 5, "malformed": 30, "random": 2, "extremes": 3}
@@ -70,7 +70,7 @@ def test_every_row_and_form_of_the_extremes_is_tried_once():
 
 def test_a_run_that_is_off_is_wrong(monkeypatch):
     """As if the finer run had ended elsewhere."""
-    scene = with_values(Scene(name="short"), {"duration": 2e-5, "frames": 2, "flagella.length": 2.0})
+    scene = with_values(paper_scene(name="short"), {"duration": 2e-5, "frames": 2, "flagella.length": 2.0})
     assert scenes.asked(scene, 1e-3) == 5e-3 and scenes.asked(scene, 1e-5) == pytest.approx(5e-4)
     assert scenes.against_finer(scene).outcome == "right"
     looks = scenes.looks

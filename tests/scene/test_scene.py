@@ -330,7 +330,7 @@ def test_examples_load_and_read_back_equal(tmp_path, path):
 
 @pytest.mark.parametrize(("cls", "name"), [case for case in SETTINGS if case[0] is not FlagellumOverride])
 def test_every_setting_is_written(cls, name):
-    line = next(line for line in dumps(paper_scene("a")).splitlines() if line.lstrip("# ").startswith(f"{name} ="))
+    line = next(line for line in dumps(Scene("a")).splitlines() if line.lstrip("# ").startswith(f"{name} ="))
     absent = line.startswith("#")
     assert absent == (cls is not Scene and getattr(cls(), name) is None)
     assert "absent: " in line or not absent

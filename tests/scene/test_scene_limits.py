@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from examples.reliability.malformed import malformed
-from warpflag.scene import FlagellumOverride, Motor, Scene, SceneError, dumps, load, loads, with_values
+from warpflag.scene import FlagellumOverride, Motor, SceneError, dumps, load, loads, paper_scene, with_values
 
 
 def lines_of(caught: pytest.ExceptionInfo[SceneError]) -> list[str]:
@@ -48,7 +48,7 @@ def test_malformed_scenes_are_refused_in_printable_lines_that_name_the_file(path
 
 def test_a_byte_order_mark_is_passed_over(path):
     path.write_bytes(b'\xef\xbb\xbfname = "bom"\nduration = 2e-4')
-    assert load(path) == Scene("bom", duration=2e-4)
+    assert load(path) == paper_scene("bom", duration=2e-4)
 
 
 DEEP = 1000
@@ -98,7 +98,7 @@ def test_ten_thousand_flagella_of_their_own_fit(path):
     own = tuple(
         FlagellumOverride(azimuth=0.036 * k + 1e-13, anchor_offset=k / 3e4, phase=-k / 7e3) for k in range(10_000)
     )
-    scene = with_values(Scene("crowd"), {"flagella.count": 10_000, "steric.enabled": False})
+    scene = with_values(paper_scene("crowd"), {"flagella.count": 10_000, "steric.enabled": False})
     scene = dataclasses.replace(scene, flagellum=own)
     path.write_text(dumps(scene))
     assert load(path) == scene
@@ -172,7 +172,7 @@ def test_of_very_many_problems_the_first_are_told_and_the_rest_counted(path):
 
 def test_a_value_of_the_group_is_at_fault_once():
     with pytest.raises(SceneError) as caught:
-        with_values(Scene("a"), {"flagella.count": 50, "flagella.anchor_offset": 3.0})
+        with_values(paper_scene("a"), {"flagella.count": 50, "flagella.anchor_offset": 3.0})
     assert len(lines_of(caught)) == 1
 
 
@@ -192,7 +192,7 @@ def test_a_value_of_the_group_is_at_fault_once():
     ],
 )
 def test_numbers_of_numpy_are_taken_as_pythons(key, number, plain):
-    taken, expected = (with_values(Scene("a"), {key: value}) for value in (number, plain))
+    taken, expected = (with_values(paper_scene("a"), {key: value}) for value in (number, plain))
     assert taken == expected and dumps(taken) == dumps(expected)
 
 
@@ -207,7 +207,7 @@ def test_what_is_no_number_of_numpy_is_refused(value):
 
 @pytest.mark.parametrize("offset", [-4.6e-05, 1e-5, 6e-6, 0.0, 5.6e-17, -1e-10, 0.01, -0.85])
 def test_small_offsets_of_a_random_draw_are_allowed(offset):
-    scene = with_values(Scene("a"), {"flagella.anchor_offset": offset, "flagellum.1.anchor_offset": offset})
+    scene = with_values(paper_scene("a"), {"flagella.anchor_offset": offset, "flagellum.1.anchor_offset": offset})
     assert scene.flagella.anchor_offset == offset
 
 
@@ -215,7 +215,7 @@ def test_small_offsets_of_a_random_draw_are_allowed(offset):
 @pytest.mark.parametrize("key", ["flagella.anchor_offset", "flagellum.0.anchor_offset"])
 def test_an_offset_in_metres_is_recognised(key, offset):
     with pytest.raises(SceneError, match="looks like metres; lengths are in um; write 0 for none"):
-        with_values(Scene("a"), {key: offset})
+        with_values(paper_scene("a"), {key: offset})
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_an_offset_in_metres_is_recognised(key, offset):
 )
 def test_a_length_in_metres_is_recognised(key):
     with pytest.raises(SceneError, match="looks like metres"):
-        with_values(Scene("a"), {key: 0.5e-6})
+        with_values(paper_scene("a"), {key: 0.5e-6})
 
 
 def test_a_torque_in_newton_metres_is_recognised_and_a_small_one_allowed():
@@ -263,9 +263,9 @@ def test_a_long_dotted_key_takes_no_gigabytes(path):
 )
 def test_crowded_anchors_are_refused_by_name(values, key):
     with pytest.raises(SceneError, match=r"nearer than a filament is thick, 0\.02 um") as caught:
-        with_values(Scene("a"), values)
+        with_values(paper_scene("a"), values)
     assert caught.value.key == key and len(lines_of(caught)) == 1
-    with_values(Scene("a"), {**values, "steric.enabled": False})
+    with_values(paper_scene("a"), {**values, "steric.enabled": False})
 
 
 @pytest.mark.parametrize(
@@ -278,4 +278,4 @@ def test_crowded_anchors_are_refused_by_name(values, key):
     ],
 )
 def test_anchors_a_filament_apart_are_allowed(values):
-    with_values(Scene("a"), values)
+    with_values(paper_scene("a"), values)
