@@ -183,19 +183,7 @@ def filament_mobility(scene: Scene, segment_length: float) -> FilamentMobility:
 
 
 def thermal_energy(scene: Scene) -> float:
-    """kT [pN um]; zero without thermal noise.
-
-    Raises:
-        SceneError: the mobility has no root, because nodes have less than the self term of the pair sum.
-    """
-    if scene.fluid.temperature > 0.0 and scene.hydrodynamics.mode != "none":
-        own = 1 / (6 * math.pi * scene.fluid.viscosity * pair_radius(scene))
-        local = [filament_mobility(scene, spec.segment_length) for spec in scene.resolved_flagella()]
-        if min(min(m.along, m.across) for m in local) < own * (1 - 1e-9):
-            problem = "is too small for thermal noise: the mobility would not be positive definite; leave it out"
-            raise SceneError(
-                "hydrodynamics.pair_radius", scene.hydrodynamics.pair_radius, problem, ["fluid.temperature"]
-            )
+    """kT [pN um]; zero without thermal noise."""
     return _BOLTZMANN * scene.fluid.temperature
 
 
