@@ -255,3 +255,10 @@ def test_arguments_are_labelled_as_they_are_used():
                         f"{stem}: {function.name}: {argument.arg}, a {kind}, stands under {label or 'nothing'}"
                     )
     assert wrong == []
+
+
+def test_a_script_for_the_type_checker_uses_every_public_name():
+    import warpflag
+
+    used = (ROOT / "tests" / "public_names.py").read_text(encoding="utf-8")
+    assert [name for name in warpflag.__all__ if f" {name}" not in used and f"warpflag.{name}" not in used] == []
