@@ -16,6 +16,7 @@ from warpflag import (
     Motor,
     NumericalError,
     Numerics,
+    Polymorphs,
     Record,
     Recorder,
     Scene,
@@ -46,6 +47,7 @@ def scene(path: Path | None = None) -> Scene:
         body=Body(length=2.5),
         external=External(body_force=(0.0, 0.0, 1.0)),
         numerics=Numerics(accuracy=1e-2),
+        polymorphs=Polymorphs(),
         start=Start(),
     )
 
