@@ -260,5 +260,5 @@ def test_arguments_are_labelled_as_they_are_used():
 def test_a_script_for_the_type_checker_uses_every_public_name():
     import warpflag
 
-    used = (ROOT / "tests" / "run" / "public_names.py").read_text(encoding="utf-8")
+    used = (ROOT / "tests" / "scene" / "public_names.py").read_text(encoding="utf-8")
     assert [name for name in warpflag.__all__ if f" {name}" not in used and f"warpflag.{name}" not in used] == []

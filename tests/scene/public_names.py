@@ -25,6 +25,7 @@ from warpflag import (
     Start,
     Steric,
     load,
+    paper_scene,
     with_values,
 )
 
@@ -50,6 +51,9 @@ def scene(path: Path | None = None) -> Scene:
         polymorphs=Polymorphs(),
         start=Start(),
     )
+
+
+PAPER = paper_scene("paper")
 
 
 def run(made: Scene, directory: Path) -> float:
