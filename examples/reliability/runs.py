@@ -15,6 +15,7 @@ from examples.reliability.attempt import PATIENCE, Found, command, found, frames
 from examples.reliability.damage import damaged
 
 SCENE = """
+format = 1
 name = "attacked"
 duration = 1.2e-3
 frames = 60

@@ -7,8 +7,10 @@ forces F of all others at the pose that the second iteration evaluates,
 
 The left side is never negative, and where the velocities V there are those of the step, it is F_all V dt, F_all the sum
 of all forces. Both are asked of every step, to within what an error of the size that the step may make does against the
-forces: |F_all| times that error. An unstable step gains energy that nothing puts in, long before any value looks
-wrong. A term that states no energy counts as a force from outside, so none can be forgotten.
+forces, |F_all| times that error, and the round-off of U. A strain of some 1 has that of its numbers, eps, so an energy
+c d^2/2 of a strain that is off by d has c d eps: together at most 2 eps sqrt(U U_1), U_1 the energy if all were off by
+1. That is what remains of a cell that comes to rest under tension. An unstable step gains energy that nothing puts in,
+long before any value looks wrong. A term that states no energy counts as a force from outside: none can be forgotten.
 
 The first step after a start has no energy before it and is not judged.
 """
@@ -17,6 +19,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpflag_kernels.base.precision import Precision
@@ -27,6 +30,8 @@ from warpflag_kernels.rod import chain_chart
 # What a step may dissipate over the power of its velocities: 1.2 at most in sound runs. Velocities of stiff modes are
 # those before the step's last correction, so they may exceed what is dissipated by far.
 MOST_DISSIPATED = 2.0
+# Round-off of the energy, over the bound above: strains come from some operations each.
+ROUND_OFF = 4.0
 # A violation counts as WEIGHT steps that keep the balance: where more than one step in ten violates it, the count
 # grows, and beyond LASTING, some twenty violations more than that, the cell is stopped.
 WEIGHT = 9
@@ -176,6 +181,7 @@ def functions(p: Precision) -> SimpleNamespace:
     Model, Balance = structs(p).Model, struct(p)
     module = p.module("balance_functions")
     most = wp.constant(wp.float64(MOST_DISSIPATED))
+    round_off = wp.constant(wp.float64(ROUND_OFF * 2.0 * np.finfo(p.name).eps))
     weight, lasting = wp.constant(wp.int32(WEIGHT)), wp.constant(wp.int32(LASTING))
 
     @wp.func(module=module)
@@ -186,14 +192,19 @@ def functions(p: Precision) -> SimpleNamespace:
         energy = zero
         power = zero
         load = zero
+        all_off = zero
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             work += balance.work[k]
             energy += balance.energy[k]
             power += balance.power[k]
             load += balance.load[k]
+            h = wp.float64(model.rod.segment_length[k])
+            bend = wp.float64(model.rod.bending_rigidity[k]) + wp.float64(model.rod.twist_rigidity[k])
+            each = wp.float64(0.5) * (wp.float64(model.rod.stretching_stiffness[k]) * h + bend / h)
+            all_off += wp.float64(model.first_node[k + 1] - model.first_node[k] - 1) * each
             k += 1
-        within = load * error
+        within = load * error + round_off * wp.sqrt(wp.max(energy, balance.stored[c]) * all_off)
         dissipated = work - (energy - balance.stored[c])
         good = dissipated > -within and dissipated < most * power * dt + within
         return good or balance.known[c] == 0, energy
