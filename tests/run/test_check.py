@@ -10,6 +10,7 @@ import pytest
 from tests.runs import small
 from warpflag.run.check import report
 from warpflag.run.check.left_out import EFFECTS, left_out
+from warpflag.run.check.polymorphs import of_polymorphs
 from warpflag.run.check.rigid import mesh_dependence, turning
 from warpflag.run.check.time_needed import Needed
 from warpflag.run.simulation import Simulation
@@ -67,3 +68,36 @@ def test_the_time_is_a_range_of_its_parts():
     said = report(small(), "cpu")
     assert "# time " in said and "frames, record and movie" in said and "# What it leaves out" in said
     assert "Reynolds number" in said
+
+
+@pytest.mark.parametrize(
+    "values, word",
+    [
+        ({}, "against the handedness"),
+        ({"motor.torque": -1.0}, "below polymorphs.nucleation 1.1"),
+        ({"motor.torque": -1.2}, None),
+        ({"motor.torque": 1.2, "flagella.intrinsic_curvature": (0.0, 1.3, 2.1)}, None),
+        ({"motor.torque": 1.2, "motor.switching": "schedule"}, "against the handedness"),
+        ({"motor.torque": 1.2, "motor.switching": "schedule", "motor.switch_times": (1e-3,)}, None),
+        ({"motor.switching": "markov", "motor.reverse_torque": 0.9}, "0.9 pN um, below"),
+        ({"motor.switching": "markov", "motor.torque": 1.3, "motor.law": "torque_speed"}, "only while motors switch"),
+        ({"motor.torque": -1.0, "polymorphs.nucleation": 0.9}, None),
+        ({"motor.torque": -1.0, "polymorphs.enabled": False}, None),
+        ({"motor.law": "rate"}, None),
+    ],
+)
+def test_polymorphs_that_no_motor_can_reach_are_told(values, word):
+    scene = small({"polymorphs.enabled": True, "flagella.length": 6.0, **values})
+    found = of_polymorphs(scene, turning(scene))
+    assert len(found) == (word is not None)
+    assert all(word in line for line in found)
+
+
+def test_the_torque_on_a_curve_is_where_it_meets_the_drag():
+    """Steady in reverse on the straight line of its curve: told to within its printed digits."""
+    values = {"motor.torque": 3.0, "motor.law": "torque_speed", "motor.switching": "markov", "flagella.length": 6.0}
+    scene = small({"polymorphs.enabled": True, "polymorphs.nucleation": 2.9, **values})
+    stiff = turning(scene)
+    (line,) = of_polymorphs(scene, stiff)
+    torque = float(line.split("about ")[1].split()[0])
+    assert torque == pytest.approx(3.0 * (1 - torque / stiff.drag / 300.0), rel=0.05)

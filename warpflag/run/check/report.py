@@ -9,6 +9,7 @@ from warpflag_kernels.stepping.right_hand_side import stages
 
 from warpflag.run.check.left_out import left_out
 from warpflag.run.check.noise import of_noise
+from warpflag.run.check.polymorphs import of_polymorphs
 from warpflag.run.check.rigid import turning
 from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
@@ -38,6 +39,7 @@ def report(scene: Scene, device: str | None = None) -> str:
     longest = float(simulation.system.control.longest_step.numpy()[0])
     values_per_frame = 6 * nodes + 2 * len(flagella) + 14
     time = needed(simulation)
+    stiff = turning(scene)
     lines = [
         f"{len(flagella)} flagella, {segments} segments, {nodes} nodes",
         f"stages of a right-hand side: {names}",
@@ -49,8 +51,9 @@ def report(scene: Scene, device: str | None = None) -> str:
         *_times(time, scene),
         *simulation.notes[0],
         *of_noise(scene, longest),
+        *of_polymorphs(scene, stiff),
     ]
-    without = left_out(scene, turning(scene))
+    without = left_out(scene, stiff)
     own = "" if scene.flagellum else "\n" + flagellum_example()
     return (
         dumps(scene)

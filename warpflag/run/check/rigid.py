@@ -23,12 +23,14 @@ class Turning:
         axial_length: of the helix [um].
         radius: of the helix [um].
         tip_speed: of a node [um/s].
+        drag: torque over rate [pN um s].
     """
 
     rate: float
     axial_length: float
     radius: float
     tip_speed: float
+    drag: float
 
 
 def turning(scene: Scene, segment_length: float | None = None) -> Turning:
@@ -54,7 +56,8 @@ def turning(scene: Scene, segment_length: float | None = None) -> Turning:
     spin = spec.segment_count / filament_mobility(scene, h).spin  # segments also turn about themselves
     about = resistance[0, 0] + spin * (helix.rise / h) ** 2 - resistance[0, 1] ** 2 / resistance[1, 1]
     rate = abs(spec.torque) / about
-    return Turning(rate / (2 * np.pi), float(x[-1, 2]), helix.radius, rate * helix.radius)
+    drag = float(2 * np.pi * about)
+    return Turning(rate / (2 * np.pi), float(x[-1, 2]), helix.radius, rate * helix.radius, drag)
 
 
 def _mobility(scene: Scene, spec: FlagellumSpec, x: Array) -> Array:
