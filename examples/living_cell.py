@@ -1,0 +1,110 @@
+"""Pictures of docs/living-cell.md: a cell that runs and tumbles, a filament that changes form, unequal motors.
+
+    warpflag run examples/run_and_tumble.toml
+    warpflag run examples/reversal.toml
+    uv run --extra plot examples/living_cell.py [--runs runs] [-o DIR]
+
+Takes the records of the two runs and simulates the third itself, at several torques of the second motor, in 10 s.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from warpflag import Record, Simulation
+from warpflag.scene import load, with_values
+
+HERE = Path(__file__).parent
+SMOOTHING = 0.05  # s, longer than a turn of the body
+TORQUES = (3.4, 3.2, 3.0, 2.7, 2.0)  # of the second motor [pN um]; the first has 3.4
+
+options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+options.add_argument("--runs", type=Path, default=Path("runs"))
+options.add_argument("-o", dest="output", type=Path, default=Path())
+options = options.parse_args()
+options.output.mkdir(parents=True, exist_ok=True)
+
+
+def pyplot():
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot
+
+    return matplotlib.pyplot
+
+
+plt = pyplot()
+
+
+def save(figure, name: str) -> None:
+    figure.tight_layout()
+    figure.savefig(options.output / f"{name}.png", dpi=90)
+    plt.close(figure)
+
+
+def run_and_tumble() -> None:
+    """Path in the plane in which it extends most, senses of the motors, speed."""
+    with Record(options.runs / "run_and_tumble") as record:
+        t, x, drive = record.times[:], record.body_position[:], record.observables["motor_drive"][:]
+    half = round(SMOOTHING / (t[1] - t[0]) / 2)
+    window = np.ones(2 * half + 1) / (2 * half + 1)
+    smooth = np.stack([np.convolve(x[:, i], window, "valid") for i in range(3)], axis=1)
+    times, reverse = t[half:-half], (drive < 0).any(axis=1)[half:-half]
+    speed = np.linalg.norm(np.gradient(smooth, times, axis=0), axis=1)
+    plane = np.linalg.svd(smooth - smooth.mean(axis=0), full_matrices=False)[2][:2]
+    path = (smooth - smooth[0]) @ plane.T
+    figure = plt.figure(figsize=(8, 3.6))
+    grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.5])
+    axes = figure.add_subplot(grid[:, 0], xlabel="µm", ylabel="µm", title="path, from the dot")
+    axes.plot(*np.where(reverse[:, None], np.nan, path).T, label="all forward")
+    axes.plot(*np.where(reverse[:, None], path, np.nan).T, color="C3", label="a motor in reverse")
+    axes.plot(0, 0, "ko", ms=4)
+    axes.set_aspect("equal", "datalim")
+    axes.legend(frameon=False, fontsize=8)
+    axes = figure.add_subplot(grid[0, 1], title="motors in reverse", ylabel="motor", xlim=(0, t[-1]))
+    for k in range(drive.shape[1]):
+        axes.fill_between(t, k - 0.4, k + 0.4, where=drive[:, k] < 0, color="C3")
+    axes.set_yticks(range(drive.shape[1]))
+    axes.set_ylim(-0.6, drive.shape[1] - 0.4)
+    axes = figure.add_subplot(grid[1, 1], xlabel="s", ylabel="speed, µm/s", xlim=(0, t[-1]))
+    axes.plot(times, speed, "k")
+    axes.set_ylim(0)
+    save(figure, "run_and_tumble")
+
+
+def reversal() -> None:
+    """Share of the joints in the target form, and the motor's sense."""
+    with Record(options.runs / "reversal") as record:
+        t, share = 1e3 * record.times[:], record.observables["target_form_share"][:, 0]
+        drive = record.observables["motor_drive"][:, 0]
+    figure, axes = plt.subplots(figsize=(5, 2.8))
+    axes.fill_between(t, 0, 1, where=drive < 0, color="C3", alpha=0.2, lw=0, label="motor in reverse")
+    axes.plot(t, share, "k", label="joints in semicoiled form")
+    axes.set(xlabel="ms", ylabel="share", xlim=(0, t[-1]), ylim=(0, 1.02))
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    save(figure, "reversal")
+
+
+def unequal_motors() -> None:
+    """Turns by which the second motor lags, and bundle length, over time."""
+    figure, (above, below) = plt.subplots(2, sharex=True, figsize=(5, 4))
+    for torque in TORQUES:
+        values = {"flagellum.1.torque": torque, "numerics.on_accuracy": "warn"}
+        scene = with_values(load(HERE / "unequal_motors.toml"), values)
+        frames = list(Simulation(scene, device="cpu").frames(scene.duration))
+        t = [1e3 * frame.time for frame in frames]
+        angles = np.array([frame.motor_angle for frame in frames])
+        above.plot(t, (angles[:, 0] - angles[:, 1]) / (2 * np.pi), label=f"{torque:g}")
+        length = np.convolve([frame.observables["bundle_length"] for frame in frames], np.ones(25) / 25, "valid")
+        below.plot(t[12:-12], length)
+    above.set(ylabel="lag, turns", ylim=(-0.5, 8), title="3.4 pN µm, and the second motor's:")
+    above.legend(frameon=False, fontsize=8, ncols=len(TORQUES), loc="upper left")
+    below.set(xlabel="ms", ylabel="$l_r$, mean of 5 ms", xlim=(0, t[-1]))
+    save(figure, "unequal_motors")
+
+
+run_and_tumble()
+reversal()
+unequal_motors()
