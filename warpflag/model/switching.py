@@ -59,8 +59,8 @@ def _markov(
 ) -> tuple[float, ...]:
     """Switches of a two-state Markov process that is forward at time 0.
 
-    Ticks of a Poisson clock at the rate of a switch have the motor switch if it is in the state that the switch leaves;
-    what ticks otherwise is ignored, which a clock without memory allows. With coupling c a share c of each rate is of
+    Each direction has a Poisson clock at its switching rate. A tick switches the motor only if it is in the state that
+    this direction leaves; other ticks are ignored, which changes nothing, since the clock has no memory. With coupling c a share c of each rate is of
     clocks of the cell, the rest of the motor's own, so that each motor's own law does not depend on c.
     """
     clocks = [

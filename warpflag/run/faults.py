@@ -38,7 +38,7 @@ _ADVICE = {
         "ask for less accuracy, or go on with numerics.on_accuracy = warn",
     ),
     Fault.BALANCE: (
-        "steps, however short, gain energy that nothing puts in: power balance violated",
+        "steps gain energy that nothing puts in, or lose more than the fluid takes: power balance violated",
         "take numerics.stepper = rkc",
     ),
     Fault.UNSTABLE: (

@@ -77,7 +77,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 def tensor_code(p: Precision, unequal: bool, sums: str) -> str:
-    """C++ that defines tensor(r2, j, c, d) of node i: the one place of the law.
+    """C++ that defines tensor(r2, j, c, d) of node i; equal and unequal radii have a file each.
 
     Args:
         p: precision of the pairs.

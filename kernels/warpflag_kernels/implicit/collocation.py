@@ -7,8 +7,8 @@ theta w delta + e, so
     e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
 
 and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
-theta above 2^-1/2, but alternate in sign for some steps below 1. So a step that ends at an output time takes theta = 1,
-which is BDF2: recorded forces and energies are then those of an equilibrated state. Both iterations evaluate V once, at
+theta above 2^-1/2, but alternate in sign for some steps below 1. So the last step of an advance takes theta = 1, which is
+BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside do not. Both iterations evaluate V once, at
 the pose known so far, and solve for what is missing:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
@@ -39,7 +39,7 @@ from warpflag_kernels.stepping import accuracy, balance, step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.step_control import StepControl
 
-# Collocation point of a step that does not end at an output time, as a fraction of the step. The truncation error
+# Collocation point of a step that is not the last of an advance, as a fraction of the step. The truncation error
 # falls with it as 3 theta^2 - 1, but stiff modes die out more slowly: a step leaves 0.67 of them at
 # 0.8 and 0.84 at 0.75 (docs/numerics.md).
 THETA = 0.8

@@ -62,7 +62,7 @@ def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -
         model: Model,
         # State:
         state: State,
-        remaining: wp.array(dtype=wp.float64),
+        trust: wp.array(dtype=wp.float64),
         predicted: Increment,
         contacts_in: Contacts,
         # Out:
@@ -74,8 +74,8 @@ def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -
         i = contacts_in.first[c] + thread
         while i < contacts_in.first[c] + contacts_in.count[c]:
             gap = contacts_in.gap[i]
-            if remaining[c] > wp.float64(0.0):
-                gap += real(remaining[c]) * gap_change(model, state, contacts_in, i, predicted)
+            if trust[c] > wp.float64(0.0):
+                gap += real(trust[c]) * gap_change(model, state, contacts_in, i, predicted)
             counted = wp.max(gap, deepest * model.steric.diameter[c])
             law.force[i] = steric_force(counted, model.steric.strength[c], model.steric.diameter[c])
             law.solved_gap[i] = gap
@@ -207,18 +207,18 @@ def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -
 
 
 def warm_start(
-    model: DeviceModel, state: DeviceState, remaining: Any, predicted: Any, contacts_out: Any, law: Any
+    model: DeviceModel, state: DeviceState, trust: Any, predicted: Any, contacts_out: Any, law: Any
 ) -> None:
     """Warm start of the contact solve: forces at the predicted gaps of the listed contacts, into `force`.
 
     Args:
         model, state: of the batch.
-        remaining: fraction of the predicted increment that is still to come, shape [cell_count].
+        trust: share of the predicted increment that counts, 0 to 1, shape [cell_count].
         predicted: struct `Increment`.
         contacts_out: the listed contacts, struct `Contacts`.
         law: struct `ContactLaw`.
     """
-    inputs = [model.data, state.data, remaining, predicted, contacts_out, law]
+    inputs = [model.data, state.data, trust, predicted, contacts_out, law]
     dim = (model.cell_count, model.plan.contact_block)
     wp.launch(_kernels_of(model).warm_start, dim, inputs=inputs, device=model.device)
 

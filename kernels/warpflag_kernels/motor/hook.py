@@ -5,8 +5,9 @@ a is the axis of the helix at rest, fixed in the axes of segment 1. With c = cos
     E = (k/2) |2 tan(beta/2)|^2 = 2 k |a x m|^2/(1 + c)^2,     k = k_0 (1 + |T_m|/T_s),
 
 which grows without bound toward 180 degrees. The joint puts the torque t_h = -dE/dc a x m = 4 k/(1 + c)^2 a x m on
-segment 1, as a pair of forces across its tangent and a torque about it, and -t_h on the body. Twist of the hook belongs
-to the elastic term, as does the change of the hook's forces, since the second derivatives join those of that joint.
+segment 1, as a pair of forces across its tangent and a torque about it, and -t_h on the body. The hook's twist
+is in `rod/elastic.py`. The second derivatives of the bending are added to those of joint 0, so the linearised elastic
+term has the change of these forces, too.
 
 The stiffening takes the motor's torque as a given number: it is no part of the derivatives.
 """

@@ -7,9 +7,9 @@ forces F of all others at the pose that the second iteration evaluates,
 
 The left side is never negative, and where the velocities V there are those of the step, it is F_all V dt, F_all the sum
 of all forces. Both are asked of every step, to within what an error of the size that the step may make does against the
-forces, |F_all| times that error, and the round-off of U. A strain of some 1 has that of its numbers, eps, so an energy
-c d^2/2 of a strain that is off by d has c d eps: together at most 2 eps sqrt(U U_1), U_1 the energy if all were off by
-1. That is what remains of a cell that comes to rest under tension. An unstable step gains energy that nothing puts in,
+forces, |F_all| times that error, and the round-off of U. A strain near 1 has a round-off of eps. The energy c d^2/2 of
+a strain that is d from its rest value is then uncertain by c d eps, all together by at most 2 eps sqrt(U U_1), U_1 the
+energy if every d were 1. That is what is left when a cell comes to rest under tension. An unstable step gains energy that nothing puts in,
 long before any value looks wrong. A term that states no energy counts as a force from outside: none can be forgotten.
 
 The first step after a start has no energy before it and is not judged.
@@ -69,7 +69,7 @@ def holds(model: DeviceModel) -> bool:
 
 
 def allocate(model: DeviceModel) -> Any:
-    """Arrays of the struct `Balance`, zero; where the balance does not hold, those of single elements are empty."""
+    """Arrays of the struct `Balance`, zero."""
     p, device = model.precision, model.device
     b = struct(p)()
     b.node = wp.zeros(model.element_count, dtype=p.vec4, device=device)

@@ -25,9 +25,8 @@ from warpflag_kernels.rod import chain_chart, rotations
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
 
-# Newton iterations. Each leaves the square of the relative error; the body, which moves by the pull of its flagella
-# between them, holds its anchors some six times as firmly as the fluid holds a node: after the last one half a per cent
-# of its share is left.
+# Newton iterations. Each leaves the square of the relative error. Between two of them the body moves by its flagella's
+# pull; it yields six times less than a node, so after four 0.5 % of the body's part of the length error remain.
 LENGTH_ITERATIONS = 4
 
 
