@@ -60,8 +60,9 @@ def _markov(
     """Switches of a two-state Markov process that is forward at time 0.
 
     Each direction has a Poisson clock at its switching rate. A tick switches the motor only if it is in the state that
-    this direction leaves; other ticks are ignored, which changes nothing, since the clock has no memory. With coupling c a share c of each rate is of
-    clocks of the cell, the rest of the motor's own, so that each motor's own law does not depend on c.
+    this direction leaves; other ticks are ignored, which changes nothing, since the clock has no memory. With coupling
+    c a share c of each rate is of clocks of the cell, the rest of the motor's own, so that each motor's own law does
+    not depend on c.
     """
     clocks = [
         (to_reverse * (1 - coupling), 2 * motor + 2, -1),

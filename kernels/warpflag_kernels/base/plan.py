@@ -93,8 +93,8 @@ class Plan:
         device: Warp's device.
         precision: of positions and forces, and the build.
         pair_precision: of the terms of the Rotne-Prager sum.
-        launch: "cells": one thread takes a whole cell, an explicit right-hand side in one launch; "elements": one thread for
-            every node, flagellum or cell, stage by stage.
+        launch: "cells": one thread takes a whole cell, an explicit right-hand side in one launch; "elements": one
+            thread for every node, flagellum or cell, stage by stage.
         pair_sum: "symmetric": every pair once for both nodes; "warp" or "thread": pairs gathered at every node, by the
             threads of a warp or by one; "none": no pairs.
         step_pairs: the sum over pairs at positions that stand still during an implicit step. "stored": symmetric, with

@@ -7,9 +7,9 @@ theta w delta + e, so
     e/dt = g [V - w delta/dt],    rho = theta (1 - (1 - theta) mu),    g = rho/(1 + (2 theta - 1) mu),
 
 and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
-theta above 2^-1/2, but alternate in sign for some steps below 1. So the last step of an advance takes theta = 1, which is
-BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside do not. Both iterations evaluate V once, at
-the pose known so far, and solve for what is missing:
+theta above 2^-1/2, but alternate in sign for some steps below 1. So the last step of an advance takes theta = 1, which
+is BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside do not. Both
+iterations evaluate V once, at the pose known so far, and solve for what is missing:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 

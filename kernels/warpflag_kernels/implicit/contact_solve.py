@@ -206,9 +206,7 @@ def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -
     return SimpleNamespace(warm_start=warm_start, solve=solve)
 
 
-def warm_start(
-    model: DeviceModel, state: DeviceState, trust: Any, predicted: Any, contacts_out: Any, law: Any
-) -> None:
+def warm_start(model: DeviceModel, state: DeviceState, trust: Any, predicted: Any, contacts_out: Any, law: Any) -> None:
     """Warm start of the contact solve: forces at the predicted gaps of the listed contacts, into `force`.
 
     Args:

@@ -9,8 +9,9 @@ The left side is never negative, and where the velocities V there are those of t
 of all forces. Both are asked of every step, to within what an error of the size that the step may make does against the
 forces, |F_all| times that error, and the round-off of U. A strain near 1 has a round-off of eps. The energy c d^2/2 of
 a strain that is d from its rest value is then uncertain by c d eps, all together by at most 2 eps sqrt(U U_1), U_1 the
-energy if every d were 1. That is what is left when a cell comes to rest under tension. An unstable step gains energy that nothing puts in,
-long before any value looks wrong. A term that states no energy counts as a force from outside: none can be forgotten.
+energy if every d were 1. That is what is left when a cell comes to rest under tension. An unstable step gains energy
+that nothing puts in, long before any value looks wrong. A term that states no energy counts as a force from outside:
+none can be forgotten.
 
 The first step after a start has no energy before it and is not judged.
 """
