@@ -51,12 +51,53 @@ def test_file_is_h5md(tmp_path):
         assert set(file["observables"]) == {"bundle_length", "motor_rate"}
 
 
+def test_file_has_units_and_scales(tmp_path):
+    with h5py.File(written(tmp_path / "run.h5", 12)) as file:
+        assert list(file["h5md/modules/units"].attrs["version"]) == [1, 0]
+        time = file["particles/flagella/position/time"]
+        assert time.attrs["unit"] == "s" and time.is_scale
+        for entry in ENTRIES:
+            scale = file[entry]["value"].dims[0][0]
+            assert scale == time and len(scale) == 12, entry
+        units = {entry: file[entry]["value"].attrs.get("unit") for entry in ENTRIES}
+        assert units["cell/body_position"] == "um" and units["cell/motor_angle"] == "rad"
+        assert units["observables/motor_rate"] == "Hz" and units["observables/bundle_length"] is None
+        position = file["particles/flagella/position/value"].attrs
+        assert position["units"] == "um" and "unit" not in position  # MDAnalysis does not know um
+
+
+def test_other_readers_open_a_record_that_was_read(tmp_path):
+    """HDF5 refuses to open a file twice in a process with and without a lock."""
+    path = written(tmp_path / "run.h5", 12)
+    record = Record(path)
+    positions = record.positions
+    np.testing.assert_array_equal(positions[3], frame(3).positions)
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(file["particles/flagella/position/value"][5], frame(5).positions)
+        np.testing.assert_array_equal(positions[4], frame(4).positions)
+
+
+def test_a_closed_record_sees_what_came_since(tmp_path):
+    recorder = started(tmp_path / "run.h5")
+    recorder.write(frame(0))
+    record = Record(tmp_path)
+    assert record.frame_count == 1
+    recorder.write(frame(1))
+    recorder.flush()
+    assert record.frame_count == 1
+    record.close()
+    assert_holds_frames(record, range(2))
+    recorder.close()
+
+
 def test_mdanalysis_opens_it(tmp_path):
     mdanalysis = pytest.importorskip("MDAnalysis")
     written(tmp_path / "run.h5", 12)
     universe = mdanalysis.Universe.empty(9)
-    universe.load_new(str(tmp_path / "run.h5"), format="H5MD", convert_units=False)
+    universe.load_new(str(tmp_path / "run.h5"), format="H5MD", convert_units=False, dt=1e-4)
     assert len(universe.trajectory) == 12
+    assert universe.trajectory.units["time"] == "s" and universe.trajectory.dt == 1e-4
+    assert universe.trajectory[7].time == frame(7).time
     universe.trajectory[7]
     np.testing.assert_allclose(universe.atoms.positions, frame(7).positions, rtol=1e-6)
 

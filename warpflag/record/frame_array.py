@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,10 @@ class FrameArray:
     raises RecordError.
 
     Args:
-        dataset: of HDF5, frames first.
+        read: gives the frames from one to before another, shape [last - first, ...].
+        shape: of one frame.
         sums: checksums of the committed frames, shape [frame_count]; None for a record without.
-        frame_count: number of committed frames; what the dataset holds beyond is left out.
+        frame_count: number of committed frames; what the file holds beyond is left out.
         path: the file, for messages.
         name: of the quantity, for messages.
 
@@ -48,12 +49,20 @@ class FrameArray:
         shape: [frame_count, ...].
     """
 
-    def __init__(self, dataset: Any, sums: NDArray[np.uint32] | None, frame_count: int, path: Path, name: str):
-        self._dataset = dataset
+    def __init__(
+        self,
+        read: Callable[[int, int], NDArray[Any]],
+        shape: tuple[int, ...],
+        sums: NDArray[np.uint32] | None,
+        frame_count: int,
+        path: Path,
+        name: str,
+    ):
+        self._read = read
         self._sums = sums
         self._path = path
         self._name = name
-        self.shape: tuple[int, ...] = (frame_count, *dataset.shape[1:])
+        self.shape: tuple[int, ...] = (frame_count, *shape)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -67,7 +76,7 @@ class FrameArray:
             return np.empty(self.shape)[key]
         low = int(rows.min())
         with reading(self._path, "frames can't be read"):
-            block = np.asarray(self._dataset[low : int(rows.max()) + 1])
+            block = np.asarray(self._read(low, int(rows.max()) + 1))
             if len(block) != int(rows.max()) + 1 - low:
                 raise RecordError(f"{self._path}: is damaged: /{self._name} ends before frame {int(rows.max())}")
         self._verify(block, low)

@@ -17,8 +17,8 @@ Units um, pN, s, rad. Every entry but the parameters and checksums is a group of
     /parameters                                              attribute checksum: CRC-32 of all of the above
 
 /cell and /parameters stay out of /particles, where readers of H5MD expect one group with per-node entries.
-All entries share one step and one time dataset (hard links). `step` is written last: its length is the number
-of committed frames, and everything else is cut to it.
+All entries share one step and one time dataset (hard links); time is a dimension scale of HDF5, attached to all others.
+`step` is written last: its length is the number of committed frames, and everything else is cut to it.
 
 Checksums are kept by frame rather than by HDF5's filter by chunk, because a chunk is written again with every block of
 frames that goes into it: a process killed in the middle would leave frames that were good before with a wrong checksum.
@@ -45,6 +45,7 @@ __all__ = [
     "PARAMETERS",
     "POSITION",
     "RECORD_NAME",
+    "UNITS",
     "Frame",
     "RecordError",
     "checksum",
@@ -64,6 +65,23 @@ BODY_ORIENTATION = "cell/body_orientation"
 ENTRIES = (POSITION, E1, MOTOR_ANGLE, BODY_POSITION, BODY_ORIENTATION)
 CHECKSUMS = "checksums"
 PARAMETERS = ("scene", "scene_sha256", "first_node", "filament_radius", "body_length", "body_width")
+
+UNITS = {
+    "time": "s",
+    POSITION: "um",
+    MOTOR_ANGLE: "rad",
+    BODY_POSITION: "um",
+    "observables/phase_difference": "rad",
+    "observables/steric_force_density": "pN um-1",
+    "observables/elastic_energy": "pN um",
+    "observables/body_speed": "um s-1",
+    "observables/body_rate": "Hz",
+    "observables/motor_rate": "Hz",
+    "observables/motor_torque": "pN um",
+}
+"""Units by entry, as H5MD writes them; what is not here is a pure number. They are in the file as the attribute `units`
+of the values, which xarray and others show, and as `unit`, which H5MD asks for: of all but the positions, since
+MDAnalysis refuses a file whose positions have a unit that it doesn't know, such as um."""
 
 
 class RecordError(ValueError):

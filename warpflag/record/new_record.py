@@ -14,6 +14,7 @@ from warpflag.record.layout import (
     E1,
     MOTOR_ANGLE,
     POSITION,
+    UNITS,
     Frame,
     checksum,
     dataset_path,
@@ -74,9 +75,14 @@ def first_image(values: Mapping[str, Any], parameters: Mapping[str, Any]) -> byt
         # The shared datasets first, under the entry that every record has.
         for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
             _add_dataset(file, name, values[name])
+        file["h5md"].create_group("modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
+        time = file[dataset_path("time")]
+        time.make_scale("time")
+        for name in values:
+            _describe(file[dataset_path(name)], name, time)
         for name in values.keys() - {"step", "time", POSITION}:
             file[f"{name}/step"] = file[dataset_path("step")]
-            file[f"{name}/time"] = file[dataset_path("time")]
+            file[f"{name}/time"] = time
         sums = _add_dataset(file, CHECKSUMS, np.array([checksum(value) for value in values.values()], dtype=np.uint32))
         sums.attrs["entries"] = np.array([_text(name) for name in values])
         add_parameters(file, parameters)
@@ -121,6 +127,16 @@ def _add_dataset(file: Any, name: str, value: Any) -> Any:
     chunk = int(np.clip(_CHUNK_BYTES // max(1, first.nbytes), 16, 64))
     shape = first.shape[1:]
     return file.create_dataset(dataset_path(name), data=first, maxshape=(None, *shape), chunks=(chunk, *shape))
+
+
+def _describe(dataset: Any, name: str, time: Any) -> None:
+    """Gives the frames of an entry their unit and the scale of their first dimension."""
+    if name in UNITS:
+        dataset.attrs["units"] = UNITS[name]
+        if name != POSITION:
+            dataset.attrs["unit"] = UNITS[name]
+    if name != "time":
+        dataset.dims[0].attach_scale(time)
 
 
 def _text(text: str) -> np.bytes_:

@@ -29,46 +29,42 @@ from warpflag.record.layout import (
     text_of,
 )
 
-__all__ = ["OpenRecord", "open_record"]
+__all__ = ["Contents", "open_file", "read_contents"]
 
 _ATTEMPTS = 10
 _SECONDS_BETWEEN = 0.01
 
 
 @dataclass(frozen=True)
-class OpenRecord:
-    """A record as it was when it was opened.
+class Contents:
+    """What a record holds beside its frames, as it was when it was looked at.
 
     Attributes:
-        file: of h5py, open for reading.
         parameters: what /parameters holds, by name.
-        entries: names of what is kept frame by frame: step, time, the entries, the observables, and checksums if any.
+        shapes: of one frame, by the name of what is kept frame by frame: step, time, the entries, the observables, and
+            checksums if any.
         frame_count: number of committed frames.
         sums: checksums of the committed frames by entry, shape [frame_count]; empty for a record without.
     """
 
-    file: Any
     parameters: dict[str, Any]
-    entries: tuple[str, ...]
+    shapes: dict[str, tuple[int, ...]]
     frame_count: int
     sums: dict[str, NDArray[np.uint32]]
 
 
-def open_record(path: Path) -> OpenRecord:
-    """Opens a record, also one that a run is writing: then once more where a block was written meanwhile.
+def read_contents(path: Path) -> Contents:
+    """Looks into a record, also into one that a run is writing: then once more where a block was written meanwhile.
 
     Raises:
         RecordError: the file is damaged, or no record of this program.
     """
     for attempt in range(_ATTEMPTS):
         before = _state(path)
-        file = None
         try:
-            file = _open_file(path)
-            return _checked(path, file)
+            with open_file(path) as file:
+                return _checked(path, file)
         except RecordError:
-            if file is not None:
-                file.close()
             time.sleep(_SECONDS_BETWEEN)
             if attempt + 1 == _ATTEMPTS or _state(path) == before:
                 raise
@@ -82,7 +78,12 @@ def _state(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def _open_file(path: Path) -> Any:
+def open_file(path: Path) -> Any:
+    """The file of h5py, open for reading; it is the caller's to close.
+
+    Raises:
+        RecordError: it can't be opened.
+    """
     import h5py
 
     with reading(path, "not a readable HDF5 file"):
@@ -96,7 +97,7 @@ def _open_file(path: Path) -> Any:
             return h5py.File(path, "r")
 
 
-def _checked(path: Path, file: Any) -> OpenRecord:
+def _checked(path: Path, file: Any) -> Contents:
     """What a file holds; shapes are compared with each other and with the flagella, the parameters with their sum."""
     with reading(path, "is damaged"):
         missing = [entry for entry in (*ENTRIES, "parameters/first_node") if entry not in file]
@@ -113,7 +114,8 @@ def _checked(path: Path, file: Any) -> OpenRecord:
                 raise RecordError(f"{path}: is damaged: /{CHECKSUMS} does not list the entries of the record")
             sums = dict(zip(listed, dataset[:frames].T, strict=True))
             entries.append(CHECKSUMS)
-    return OpenRecord(file, parameters, tuple(entries), frames, sums)
+        shapes = {name: tuple(file[dataset_path(name)].shape[1:]) for name in entries}
+    return Contents(parameters, shapes, frames, sums)
 
 
 def _check_shapes(path: Path, file: Any, entries: list[str], frames: int, first_node: NDArray[np.int64]) -> None:

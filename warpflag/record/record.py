@@ -6,7 +6,7 @@ checksums as they are read. Records of versions that wrote no checksums are read
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from warpflag.record.layout import (
     RecordError,
     dataset_path,
 )
-from warpflag.record.opening import OpenRecord, open_record
+from warpflag.record.opening import Contents, open_file, read_contents
 
 __all__ = ["Record"]
 
@@ -37,8 +37,10 @@ _BEHAVIOUR = "warpflag.observables.behaviour.of_record"  # options of its functi
 class Record:
     """Reads run.h5, also while a run writes it or after one was killed: the frames committed by then.
 
-    It is opened at the first access and stays open until close() or the end of a `with` block. Every access raises
-    RecordError where the file is damaged or no record of this program.
+    Every access opens the file and closes it again, so that other readers in the same process (xarray, MDAnalysis,
+    h5py) find it free; in a `with` block it stays open, which is quicker where frames are read one by one. How many
+    frames there are is looked up once; close() forgets it, and the next access sees what was committed since. Every
+    access raises RecordError where the file is damaged or no record of this program.
 
     Args:
         path: the file, or the run directory that holds it.
@@ -52,6 +54,9 @@ class Record:
         if self.path.is_dir():
             self.path = self.path / RECORD_NAME
         self._arrays: dict[str, FrameArray] = {}
+        self._datasets: dict[str, Any] = {}
+        self._file: Any = None
+        self._stays_open = False
         if not self.path.is_file():
             raise RecordError(f"{self.path}: no such record")
 
@@ -73,31 +78,36 @@ class Record:
     _repr_html_ = method_from("warpflag.view.page", "notebook_frame", "The page of the record, as a notebook shows it.")
 
     def __enter__(self) -> Record:
+        self._stays_open = True
         return self
 
     def __exit__(self, *exception: object) -> None:
+        self._stays_open = False
         self.close()
 
     def close(self) -> None:
-        """Closes the file, if it was opened."""
+        """Closes the file, if it is open, and forgets what was read; the record may be used again."""
         self._arrays.clear()
-        if "_opened" in self.__dict__:
+        self._datasets.clear()
+        self.__dict__.pop("_contents", None)
+        file, self._file = self._file, None
+        if file is not None:
             with reading(self.path, "can't be closed"):
-                self.__dict__.pop("_opened").file.close()
+                file.close()
 
     @cached_property
-    def _opened(self) -> OpenRecord:
-        return open_record(self.path)
+    def _contents(self) -> Contents:
+        return read_contents(self.path)
 
     @property
     def entries(self) -> tuple[str, ...]:
         """Names of what is kept frame by frame: step, time, the entries, the observables, and checksums if any."""
-        return self._opened.entries
+        return tuple(self._contents.shapes)
 
     @property
     def frame_count(self) -> int:
-        """Number of committed frames when the record was opened."""
-        return self._opened.frame_count
+        """Number of committed frames at the first access, or the first one after close()."""
+        return self._contents.frame_count
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -105,17 +115,29 @@ class Record:
 
         Lengths in um; first_node has the shape [flagellum_count + 1], versions maps names to versions.
         """
-        return self._opened.parameters
+        return self._contents.parameters
 
     def _frames(self, name: str) -> FrameArray:
-        """The frames of one entry; kept, because HDF5 forgets the chunks of a dataset that is opened anew."""
+        """The frames of one entry."""
         if name not in self._arrays:
-            opened = self._opened
-            with reading(self.path, "frames can't be read"):
-                dataset = opened.file[dataset_path(name)]
-                array = FrameArray(dataset, opened.sums.get(name), opened.frame_count, self.path, name)
-            self._arrays[name] = array
+            contents = self._contents
+            if name not in contents.shapes:
+                raise RecordError(f"{self.path}: has no /{dataset_path(name)}")
+            read = partial(self._read, name)
+            shape, sums = contents.shapes[name], contents.sums.get(name)
+            self._arrays[name] = FrameArray(read, shape, sums, contents.frame_count, self.path, name)
         return self._arrays[name]
+
+    def _read(self, name: str, first: int, last: int) -> NDArray[Any]:
+        """Frames first to last - 1 of one entry, as the file holds them."""
+        if not self._stays_open:
+            with open_file(self.path) as file:
+                return file[dataset_path(name)][first:last]
+        if self._file is None:
+            self._file = open_file(self.path)
+        if name not in self._datasets:  # kept, because HDF5 forgets the chunks of a dataset that is opened anew
+            self._datasets[name] = self._file[dataset_path(name)]
+        return self._datasets[name][first:last]
 
     @property
     def times(self) -> NDArray[np.float64]:

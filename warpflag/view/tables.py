@@ -8,24 +8,17 @@ import numpy as np
 
 from warpflag.base.output import OutputError
 from warpflag.record import Record
+from warpflag.record.layout import BODY_ORIENTATION, BODY_POSITION, E1, MOTOR_ANGLE, POSITION, UNITS
 
 __all__ = ["dataset"]
 
-# Dimensions after the frame, unit and meaning of what is no observable.
+# Where it is in the file, dimensions after the frame, and meaning of what is no observable.
 _ENTRIES = {
-    "position": (("node", "axis"), "um", "nodes in lab axes"),
-    "director": (("node", "axis"), "", "director e1 of motor tripod and segments"),
-    "motor_angle": (("flagellum",), "rad", "turn of each motor relative to the body, accumulated"),
-    "body_position": (("axis",), "um", "centre of the body"),
-    "body_orientation": (("quaternion",), "", "quaternion from body to lab axes"),
-}
-_UNITS = {
-    "steric_force_density": "pN/um",
-    "elastic_energy": "pN um",
-    "body_speed": "um/s",
-    "body_rate": "Hz",
-    "motor_rate": "Hz",
-    "motor_torque": "pN um",
+    "position": (POSITION, ("node", "axis"), "nodes in lab axes"),
+    "director": (E1, ("node", "axis"), "director e1 of motor tripod and segments"),
+    "motor_angle": (MOTOR_ANGLE, ("flagellum",), "turn of each motor relative to the body, accumulated"),
+    "body_position": (BODY_POSITION, ("axis",), "centre of the body"),
+    "body_orientation": (BODY_ORIENTATION, ("quaternion",), "quaternion from body to lab axes"),
 }
 
 
@@ -50,11 +43,12 @@ def dataset(record: Record) -> Any:
         "body_orientation": record.body_orientation,
     }
     variables = {}
-    for name, (dimensions, unit, meaning) in _ENTRIES.items():
-        variables[name] = (("time", *dimensions), values[name], {"units": unit, "long_name": meaning})
+    for name, (entry, dimensions, meaning) in _ENTRIES.items():
+        about = {"units": UNITS.get(entry, ""), "long_name": meaning}
+        variables[name] = (("time", *dimensions), values[name], about)
     for name, found in record.observables.items():
         dimensions = ("time", "flagellum")[: found.ndim]
-        variables[name] = (dimensions, found, {"units": _UNITS.get(name, "")})
+        variables[name] = (dimensions, found, {"units": UNITS.get(f"observables/{name}", "")})
     first_node = record.first_node
     counts = np.diff(first_node)
     coordinates = {
