@@ -147,7 +147,6 @@ def test_reporters_take_the_frames_of_a_run_and_of_what_follows(tmp_path):
 
 
 def test_a_run_shows_a_bar_on_a_terminal_and_is_quiet_in_a_log(monkeypatch, capfd):
-    pytest.importorskip("tqdm")
     simulation = Simulation(small(), device="cpu")
     simulation.run(4e-5, progress=True)
     assert capfd.readouterr().err == ""

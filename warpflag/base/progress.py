@@ -1,4 +1,4 @@
-"""The progress line of a run: simulated time, computing time per simulated millisecond, time left."""
+"""The progress of long work: a bar of tqdm on a terminal or in a notebook, a line now and then in a log."""
 
 from __future__ import annotations
 
@@ -7,24 +7,20 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
-from typing import TextIO
+from typing import Any, TextIO
 
 from warpflag.base.streams import is_terminal, say
 
-__all__ = ["Progress", "watching"]
+__all__ = ["Progress", "bar", "watching"]
 
-_BAR_CELLS = 10
-_NARROWEST = 30  # columns: percentage and times stand in any case
-_TERMINAL_INTERVAL = 0.1
+_WIDEST = 100  # columns of a bar
+_WIDE = 79  # columns of a bar from which on it tells the speed, too
 _LOG_INTERVAL = 60.0
 _LOG_SHARE = 0.01
-# The speed is shown once this much has been run, in seconds or as a share of the whole: the first moments cost more.
-_SECONDS_BEFORE_SPEED = 2.0
-_SHARE_BEFORE_SPEED = 0.01
 
 
 class Progress:
-    """Shows how far a run is: a bar that is redrawn on a terminal; anywhere else a line a minute, a percent apart.
+    """Shows how far a run is: a bar on a terminal; anywhere else a line a minute, a percent apart.
 
     The first update sets the point from which speed is measured: call it before the first step (after
     compiling, and at the time from which a run is resumed), then as often as is handy. A stream that can't be
@@ -34,7 +30,7 @@ class Progress:
         total: simulated time to reach [s].
         stream: where to write; default: standard error.
         quiet: write nothing.
-        clock: seconds that pass, for tests.
+        clock: seconds that pass, for the lines of a log; for tests.
     """
 
     def __init__(
@@ -48,12 +44,11 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._quiet = quiet
         self._clock = clock
-        self._terminal = is_terminal(self._stream)
+        self._bar: Any = None
         self._start: tuple[float, float] | None = None
         self._shown_at = 0.0
         self._time: float | None = None
         self._shown: float | None = None
-        self._width = 0
 
     def update(self, time: float) -> None:
         """Reports the simulated time reached [s]."""
@@ -64,66 +59,82 @@ class Progress:
         if self._start is None:
             self._start = (now, time)
             self._shown_at = now
-            if self._terminal:
-                self._show(now)
-        elif now - self._shown_at >= (_TERMINAL_INTERVAL if self._terminal else _LOG_INTERVAL):
+            if is_terminal(self._stream):
+                layout = "{percentage:3.0f} % |{bar}| {n:.2f} / {total:.2f} ms  {remaining} left{postfix}"
+                self._bar = bar(1e3 * self._total, layout, self._stream, 1e3 * time)
+        elif self._bar is not None:
+            self._bar.set_postfix_str(self._speed(now) if self._bar.ncols >= _WIDE else "", refresh=False)
+            self._bar.update(1e3 * time - self._bar.n)
+        elif now - self._shown_at >= _LOG_INTERVAL:
             before = self._start[1] if self._shown is None else self._shown
-            if self._terminal or time - before >= _LOG_SHARE * self._total:
+            if time - before >= _LOG_SHARE * self._total:
                 self._show(now)
 
     def close(self) -> None:
         """Shows the last time reported and ends the line."""
         if self._quiet or self._time is None:
             return
-        if self._shown != self._time:
+        if self._bar is not None:
+            self._bar.close()
+        elif self._shown != self._time:
             self._show(self._clock())
-        if self._terminal:
-            self._write("\n")
-        self._time = None
+        self._bar = self._time = None
 
     def _show(self, now: float) -> None:
-        line = self._line(now)
-        if self._terminal:
-            self._write("\r" + line.ljust(self._width))
-            self._width = len(line)
-        else:
-            self._write(line + "\n")
-        self._shown_at = now
-        self._shown = self._time
-
-    def _line(self, now: float) -> str:
         assert self._start is not None and self._time is not None
         fraction = min(1.0, self._time / self._total) if self._total > 0.0 else 1.0
         line = f"{100.0 * fraction:3.0f} %  {1e3 * self._time:.2f} / {1e3 * self._total:.2f} ms"
-        filled = int(_BAR_CELLS * fraction)
-        bar = f"[{'#' * filled}{'.' * (_BAR_CELLS - filled)}] " if self._terminal else ""
-        simulated = self._time - self._start[1]
-        elapsed = now - self._start[0]
-        known = elapsed > _SECONDS_BEFORE_SPEED or simulated >= _SHARE_BEFORE_SPEED * self._total
-        if simulated > 0.0 and known:
-            cost = elapsed / simulated
-            speed = f"  {_cost(cost)} per simulated ms"
+        speed = self._speed(now)
+        if speed:
+            cost = (now - self._start[0]) / (self._time - self._start[1])
             left = f"  {_duration(cost * (self._total - self._time))} left" if self._time < self._total else ""
-            return next(x for x in (bar + line + speed + left, bar + line + left, line + left, line) if self._fits(x))
-        return bar + line if self._fits(bar + line) else line
+            line += f"  {speed}{left}"
+        self._quiet = not say(line + "\n", self._stream)
+        self._shown_at = now
+        self._shown = self._time
 
-    def _fits(self, line: str) -> bool:
-        """Whether the terminal is wide enough for a line; the last choice is taken in any case."""
-        return not self._terminal or len(line) < shutil.get_terminal_size().columns or len(line) < _NARROWEST
+    def _speed(self, now: float) -> str:
+        """Computing time of a simulated ms: 2.1 ms, 130 ms, 1.5 s per simulated ms; empty before anything was run."""
+        assert self._start is not None and self._time is not None
+        simulated = self._time - self._start[1]
+        if simulated <= 0.0:
+            return ""
+        cost = (now - self._start[0]) / simulated
+        value, unit = (cost, "ms") if cost < 1000.0 else (cost / 1000.0, "s")
+        return f"{value:.{0 if value >= 100.0 else 1}f} {unit} per simulated ms"
 
-    def _write(self, text: str) -> None:
-        if not say(text, self._stream):
-            self._quiet = True
 
-
-def _cost(cost: float) -> str:
-    """Computing time of a simulated ms: 2.1 ms, 130 ms, 1.5 s.
+def bar(total: float, layout: str, stream: TextIO | None = None, done: float = 0.0) -> Any:
+    """A bar of tqdm that fits the terminal and is silent once its stream can't be written to.
 
     Args:
-        cost: in seconds per simulated second.
+        total: what is to be done.
+        layout: of the line, as the bar_format of tqdm.
+        stream: where to write; default: standard error.
+        done: what is done already.
     """
-    value, unit = (cost, "ms") if cost < 1000.0 else (cost / 1000.0, "s")
-    return f"{value:.{0 if value >= 100.0 else 1}f} {unit}"
+    from tqdm import tqdm
+
+    columns = min(_WIDEST, shutil.get_terminal_size().columns) - 1
+    file: Any = _Silent(sys.stderr if stream is None else stream)
+    return tqdm(total=total, initial=done, file=file, ncols=columns, bar_format=layout, smoothing=0.0, miniters=0)
+
+
+class _Silent:
+    """A stream that is not written to again after it once could not be."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._works = stream, True
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self._works = self._works and say(text, self._stream)
+        return len(text)
+
+    def flush(self) -> None:
+        """`write` does it."""
 
 
 def _duration(seconds: float) -> str:
@@ -138,7 +149,7 @@ def _duration(seconds: float) -> str:
 
 @contextmanager
 def watching(shown: bool, time: Callable[[], float], end: float) -> Iterator[Callable[[], None] | None]:
-    """A bar of tqdm, in a notebook or on a terminal; nothing is written to a log.
+    """A bar in a notebook or on a terminal; nothing is written to a log.
 
     Args:
         shown: whether there is one.
@@ -147,24 +158,19 @@ def watching(shown: bool, time: Callable[[], float], end: float) -> Iterator[Cal
 
     Returns:
         What is to be called now and then; None without a bar.
-
-    Raises:
-        ModuleNotFoundError: tqdm is not installed.
     """
     if not shown:
         yield None
         return
-    try:
-        from tqdm.auto import tqdm
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("progress=True needs tqdm: pip install 'warpflag[notebook]'", name="tqdm") from error
+    from tqdm.auto import tqdm
+
     in_notebook = any(kind.__module__ == "tqdm.notebook" for kind in tqdm.__mro__)
     begin = time()
     # disable=None: shown on a terminal only.
-    with tqdm(total=round(1e3 * (end - begin), 6), unit="ms", disable=False if in_notebook else None) as bar:
+    with tqdm(total=round(1e3 * (end - begin), 6), unit="ms", disable=False if in_notebook else None) as shown_bar:
 
         def watch() -> None:
-            bar.update(round(1e3 * (time() - begin) - bar.n, 6))
+            shown_bar.update(round(1e3 * (time() - begin) - shown_bar.n, 6))
 
         yield watch
         watch()

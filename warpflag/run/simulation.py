@@ -122,7 +122,7 @@ class Simulation:
 
         Args:
             duration: by which to advance [s].
-            progress: shows a bar, in a notebook or on a terminal; needs tqdm, the extra `notebook`.
+            progress: shows a bar, in a notebook or on a terminal; nothing in a log.
 
         Raises:
             NumericalError: a guard was violated.
