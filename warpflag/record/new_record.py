@@ -75,8 +75,8 @@ def first_image(values: Mapping[str, Any], parameters: Mapping[str, Any]) -> byt
         # The shared datasets first, under the entry that every record has.
         for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
             _add_dataset(file, name, values[name])
-        file["h5md"].create_group("modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
-        time = file[dataset_path("time")]
+        file.create_group("h5md/modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
+        time: Any = file[dataset_path("time")]
         time.make_scale("time")
         for name in values:
             _describe(file[dataset_path(name)], name, time)

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from warpflag_kernels.stepping.health import Fault
 
+from warpflag.base.device import start_warp
 from warpflag.base.progress import Progress
+from warpflag.base.streams import say
 from warpflag.record import RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
@@ -124,8 +126,8 @@ class Run:
             self._end(ended)
 
     def _prepare(self, quiet: bool, stop: Stop) -> None:
-        said = "warpflag: compiling kernels, once for each kind of scene on a machine; they are kept\n"
-        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, sys.stderr.write, [said])
+        said = "warpflag: compiling kernels, once for each kind of scene on a machine, half a minute to two; kept in "
+        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, lambda: say(f"{said}{start_warp().config.kernel_cache_dir}\n"))
         if not quiet:
             timer.start()
         stop.at_once = True
