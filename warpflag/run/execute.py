@@ -126,8 +126,9 @@ class Run:
             self._end(ended)
 
     def _prepare(self, quiet: bool, stop: Stop) -> None:
-        said = "warpflag: compiling kernels, once for each kind of scene on a machine, half a minute to two; kept in "
-        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, lambda: say(f"{said}{start_warp().config.kernel_cache_dir}\n"))
+        folder = start_warp().config.kernel_cache_dir
+        said = f"warpflag: compiling kernels, once for each kind of scene, up to two minutes; kept in {folder}\n"
+        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, say, [said])
         if not quiet:
             timer.start()
         stop.at_once = True
