@@ -260,7 +260,7 @@ def test_check_prints_a_scene_and_what_it_requires(scene, capsys):
     everything = capsys.readouterr().out
     Path("resolved.toml").write_text(everything)
     assert load("resolved.toml") == load(scene, ["frames=3"])
-    assert "steric, body contact" in everything and "pair sum (all)" in everything
+    assert "steric, body contact" in everything and "pair sum (all pairs)" in everything
     assert "2 flagella, 20 segments, 22 nodes" in everything and "cpu" in everything
     assert cli.main(["check", scene, "--set", "steric.enabled=false", "hydrodynamics.mode=none"]) == 0
     bare = capsys.readouterr().out

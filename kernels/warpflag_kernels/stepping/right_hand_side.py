@@ -120,7 +120,7 @@ def stages(model: DeviceModel) -> list[tuple[str, Callable[[DeviceModel, DeviceS
     short = ", terms in float32" if model.switches.short_pairs else ""
     pairs = "local drag"
     if model.switches.pairs != "none":
-        pairs += f" and pair sum ({model.switches.pairs}{short})"
+        pairs += f" and pair sum ({model.switches.pairs.replace('_', ' ')} pairs{short})"
     if model.switches.flows.body:
         pairs += " and flow round the body"
     return [*listed, (pairs, node_velocity.node_velocities)]
