@@ -7,16 +7,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import h5py  # noqa: TID253 (no command line starts here)
+import numpy as np
 import pytest
 
 from tests.record.frames import FIRST_NODE, assert_holds_frames, frame, started, written
 from warpflag.base.output import DiskError
 from warpflag.record import Record, RecordError
-from warpflag.record.new_record import FORMAT, growth
+from warpflag.record.layout import CHECKSUMS
+from warpflag.record.new_record import FORMAT, growth, values_of
 from warpflag.record.recorder import Recorder
+from warpflag.record.rows import Rows
 
 resource = pytest.importorskip("resource")
 
@@ -134,16 +136,16 @@ def test_the_space_reserved_is_enough_for_what_hdf5_takes_and_little_more(tmp_pa
     """Up to more chunks than a node of HDF5's tree holds, so that nodes are split."""
     path = written(tmp_path / "run.h5", 1)
     with h5py.File(path, "r+", libver=FORMAT) as file:
-        datasets: list[Any] = []
-        file.visititems(lambda _, item: datasets.append(item) if getattr(item, "chunks", None) else None)
-        assert len(datasets) > 8
+        names = [*values_of(frame(0)), CHECKSUMS]
+        datasets, every = [Rows(file, name) for name in names], []
+        file.visititems(lambda name, item: every.append(name) if getattr(item, "chunks", None) else None)
+        assert len(datasets) == len(every) > 8
         count, reserved, start = 1, 0, file.id.get_filesize()
         for _ in range(min(75, 5000 // block)):
             present, expected = file.id.get_filesize(), growth(datasets, count, count + block)
             count += block
             for dataset in datasets:
-                dataset.resize(count, axis=0)
-                dataset[count - block :] = 1
+                dataset.write(count - block, np.ones((block, *dataset.shape)))
             file.flush()
             assert file.id.get_filesize() <= present + expected
             reserved += expected - 4096

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpflag.record.layout import RecordError, checksum, one_line
+from warpflag.record.layout import RecordError, checksums, one_line
 
 __all__ = ["FrameArray", "reading"]
 
@@ -88,7 +88,7 @@ class FrameArray:
     def _verify(self, block: NDArray[Any], low: int) -> None:
         if self._sums is None:
             return
-        for index, (row, expected) in enumerate(zip(block, self._sums[low:], strict=False), low):
-            if checksum(row) != expected:
-                problem = f"frame {index} of /{self._name} does not agree with its checksum"
-                raise RecordError(f"{self._path}: is damaged: {problem}")
+        differ = np.flatnonzero(checksums(block) != self._sums[low : low + len(block)])
+        if differ.size:
+            problem = f"frame {low + differ[0]} of /{self._name} does not agree with its checksum"
+            raise RecordError(f"{self._path}: is damaged: {problem}")

@@ -48,7 +48,7 @@ __all__ = [
     "UNITS",
     "Frame",
     "RecordError",
-    "checksum",
+    "checksums",
     "dataset_path",
     "one_line",
     "parameters_checksum",
@@ -120,11 +120,17 @@ def dataset_path(name: str) -> str:
     return name if name == CHECKSUMS else f"{name}/value"
 
 
-def checksum(values: ArrayLike) -> int:
-    """CRC-32 of one frame's values of one entry, taken of their bytes as little-endian 8-byte numbers."""
-    values = np.asarray(values)
-    kind = "<i8" if values.dtype.kind in "iu" else "<f8"
-    return zlib.crc32(np.ascontiguousarray(values, dtype=kind).tobytes())
+def checksums(frames: ArrayLike) -> NDArray[np.uint32]:
+    """CRC-32 of each frame's values of one entry, taken of their bytes as little-endian 8-byte numbers.
+
+    Args:
+        frames: values of the entry, frames first.
+    """
+    frames = np.asarray(frames)
+    kind = "<i8" if frames.dtype.kind in "iu" else "<f8"
+    content = memoryview(np.ascontiguousarray(frames, dtype=kind).tobytes())
+    size = len(content) // max(1, len(frames))
+    return np.array([zlib.crc32(content[k * size : (k + 1) * size]) for k in range(len(frames))], dtype=np.uint32)
 
 
 def parameters_checksum(parameters: Mapping[str, Any]) -> int:

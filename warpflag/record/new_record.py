@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -16,10 +18,11 @@ from warpflag.record.layout import (
     POSITION,
     UNITS,
     Frame,
-    checksum,
+    checksums,
     dataset_path,
     parameters_checksum,
 )
+from warpflag.record.rows import Rows
 
 __all__ = ["FORMAT", "add_parameters", "first_image", "growth", "values_of"]
 
@@ -28,6 +31,8 @@ FORMAT = ("v108", "v108")
 while it is written, and one whose writer was killed can't be opened again."""
 
 _CHUNK_BYTES = 1 << 20
+_NUMBERS = itertools.count()
+_MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
 _TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
 
@@ -56,38 +61,72 @@ def first_image(values: Mapping[str, Any], parameters: Mapping[str, Any]) -> byt
     Raises:
         ValueError: the frame has other nodes or flagella than the parameters say.
     """
-    import h5py
-
     nodes, flagella = int(parameters["first_node"][-1]), len(parameters["first_node"]) - 1
     for name, shape in {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,)}.items():
         if np.shape(values[name]) != shape:
             raise ValueError(f"{name} of a frame has shape {np.shape(values[name])}, the scene's is {shape}")
-    in_memory = {"driver": "core", "backing_store": False, "block_size": 4096}
-    with h5py.File("record", "w", libver=FORMAT, **in_memory) as file:
+    sums = np.array([checksums(np.asarray(value)[None])[0] for value in values.values()], dtype=np.uint32)
+    version = parameters["versions"].get("warpflag", "unknown")
+    with _in_memory(_empty_image(tuple((name, np.shape(value)) for name, value in values.items()), version)) as file:
+        for name, value in {**values, CHECKSUMS: sums}.items():
+            Rows(file, name).write(0, np.asarray(value)[None])
+        add_parameters(file, parameters)
+        file.flush()
+        return file.id.get_file_image()
+
+
+@functools.lru_cache(maxsize=16)
+def _empty_image(shapes: tuple[tuple[str, tuple[int, ...]], ...], version: str) -> bytes:
+    """A record of one frame of zeros without /parameters: the same for all cells of a batch that are alike.
+
+    Args:
+        shapes: of the entries of a frame, by name.
+        version: of this program.
+    """
+    with _in_memory() as file:
         file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
         file.create_group("h5md/author").attrs["name"] = _text("unknown")
         creator = file.create_group("h5md/creator")
         creator.attrs["name"] = _text("warpflag")
-        creator.attrs["version"] = _text(parameters["versions"].get("warpflag", "unknown"))
+        creator.attrs["version"] = _text(version)
         box = file.create_group("particles/flagella/box")
         box.attrs["dimension"] = np.int32(3)
         box.attrs["boundary"] = np.array([_text("none")] * 3)
+        empty = {name: np.zeros(shape, dtype=np.int64 if name == "step" else np.float64) for name, shape in shapes}
         # The shared datasets first, under the entry that every record has.
-        for name in ("step", "time", *(name for name in values if name not in ("step", "time"))):
-            _add_dataset(file, name, values[name])
+        for name in ("step", "time", *(name for name in empty if name not in ("step", "time"))):
+            _add_dataset(file, name, empty[name])
         file.create_group("h5md/modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
         time: Any = file[dataset_path("time")]
         time.make_scale("time")
-        for name in values:
+        for name in empty:
             _describe(file[dataset_path(name)], name, time)
-        for name in values.keys() - {"step", "time", POSITION}:
+        for name in empty.keys() - {"step", "time", POSITION}:
             file[f"{name}/step"] = file[dataset_path("step")]
             file[f"{name}/time"] = time
-        sums = _add_dataset(file, CHECKSUMS, np.array([checksum(value) for value in values.values()], dtype=np.uint32))
-        sums.attrs["entries"] = np.array([_text(name) for name in values])
-        add_parameters(file, parameters)
+        sums = _add_dataset(file, CHECKSUMS, np.zeros(len(empty), dtype=np.uint32))
+        sums.attrs["entries"] = np.array([_text(name) for name in empty])
         file.flush()
         return file.id.get_file_image()
+
+
+def _in_memory(image: bytes | None = None) -> Any:
+    """A file of HDF5 in memory, open for writing.
+
+    Args:
+        image: its bytes; None: it is empty.
+    """
+    import h5py
+    from h5py import h5f, h5p
+
+    name = f"record {next(_NUMBERS)}"  # HDF5 takes files of one name for one file, also those of other threads
+    if image is None:
+        return h5py.File(name, "w", libver=FORMAT, driver="core", backing_store=False, block_size=_MEMORY_BLOCK)
+    access = h5p.create(h5p.FILE_ACCESS)
+    access.set_fapl_core(_MEMORY_BLOCK, False)
+    access.set_libver_bounds(h5f.LIBVER_V18, h5f.LIBVER_V18)
+    access.set_file_image(image)
+    return h5py.File(h5f.open(name.encode(), h5f.ACC_RDWR, access))
 
 
 def add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
@@ -101,23 +140,24 @@ def add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
     group.attrs["checksum"] = np.uint32(parameters_checksum(parameters))
 
 
-def growth(datasets: Iterable[Any], before: int, after: int) -> int:
+def growth(datasets: Iterable[Rows], before: int, after: int) -> int:
     """Bytes by which the file of a record grows at most.
 
     Args:
-        datasets: of HDF5, all that hold frames.
+        datasets: all that hold frames.
         before: number of frames that they hold.
         after: number of frames that they are to hold.
     """
     total = _SLACK_BYTES
     for dataset in datasets:
-        chunk = dataset.chunks
-        present, needed = (-(-frames // chunk[0]) for frames in (before, after))
+        present, needed = (-(-frames // dataset.chunk) for frames in (before, after))
         if needed > present:
-            node = 24 + 8 * _TREE_FANOUT + (_TREE_FANOUT + 1) * 8 * (len(chunk) + 2)
+            node = 24 + 8 * _TREE_FANOUT + (_TREE_FANOUT + 1) * 8 * (len(dataset.shape) + 3)
             # A full node of the tree is split, and so may be those above it.
             nodes = 3 + (needed - present) // 16 if needed > _TREE_FANOUT else int(present == 0)
-            total += (needed - present) * int(np.prod(chunk)) * dataset.dtype.itemsize + nodes * node
+            total += (needed - present) * dataset.chunk * int(
+                np.prod(dataset.shape)
+            ) * dataset.dtype.itemsize + nodes * node
     return total
 
 

@@ -106,29 +106,34 @@ def _checked(path: Path, file: Any) -> Contents:
         frames = len(file[dataset_path("step")])
         parameters = _parameters(path, file["parameters"])
         entries = ["step", "time", *ENTRIES, *(f"observables/{name}" for name in file.get("observables", ()))]
-        _check_shapes(path, file, entries, frames, parameters["first_node"])
+        shapes = _shapes(path, file, entries, frames, parameters["first_node"])
         sums: dict[str, NDArray[np.uint32]] = {}
         if CHECKSUMS in file:
             listed, dataset = summed_entries(file[CHECKSUMS]), file[CHECKSUMS]
             if sorted(listed) != sorted(entries) or dataset.shape[1:] != (len(entries),) or len(dataset) < frames:
                 raise RecordError(f"{path}: is damaged: /{CHECKSUMS} does not list the entries of the record")
             sums = dict(zip(listed, dataset[:frames].T, strict=True))
-            entries.append(CHECKSUMS)
-        shapes = {name: tuple(file[dataset_path(name)].shape[1:]) for name in entries}
+            shapes[CHECKSUMS] = (len(entries),)
     return Contents(parameters, shapes, frames, sums)
 
 
-def _check_shapes(path: Path, file: Any, entries: list[str], frames: int, first_node: NDArray[np.int64]) -> None:
+def _shapes(
+    path: Path, file: Any, entries: list[str], frames: int, first_node: NDArray[np.int64]
+) -> dict[str, tuple[int, ...]]:
+    """The shape of one frame of every entry, compared with the flagella and with the number of frames."""
     nodes, flagella, size = int(first_node[-1]), len(first_node) - 1, path.stat().st_size
+    found = {}
     shapes = {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,), "step": (), "time": ()}
     shapes |= {BODY_POSITION: (3,), BODY_ORIENTATION: (4,)}
     for name in entries:
         dataset = file[dataset_path(name)]
+        found[name] = tuple(dataset.shape[1:])
         allowed = [shapes[name]] if name in shapes else [(), (flagella,)]
-        fits = dataset.shape[1:] in allowed and dataset.dtype.kind == ("i" if name == "step" else "f")
+        fits = found[name] in allowed and dataset.dtype.kind == ("i" if name == "step" else "f")
         if not fits or len(dataset) < frames or frames * dataset.dtype.itemsize > size:
             problem = f"/{dataset_path(name)} has the shape {dataset.shape}, type {dataset.dtype}"
             raise RecordError(f"{path}: is damaged: {problem} beside {frames} frames, {nodes} nodes")
+    return found
 
 
 def _parameters(path: Path, group: Any) -> dict[str, Any]:

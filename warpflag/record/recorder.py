@@ -26,14 +26,14 @@ from warpflag.record.layout import (
     CHECKSUMS,
     Frame,
     RecordError,
-    checksum,
-    dataset_path,
+    checksums,
     one_line,
     parameters_checksum,
     summed_entries,
 )
 from warpflag.record.new_record import FORMAT, add_parameters, first_image, growth, values_of
 from warpflag.record.record import Record
+from warpflag.record.rows import Rows
 
 __all__ = ["Recorder"]
 
@@ -72,7 +72,7 @@ class Recorder:
         self._file: Any = None
         self._disk: DiskFile | None = None
         self._parameters: dict[str, Any] = {}
-        self._datasets: dict[str, Any] = {}
+        self._datasets: dict[str, Rows] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._summed: list[str] = []  # entries in the order of their checksums
         self._committed = 0
@@ -188,15 +188,12 @@ class Recorder:
         count = self._committed + len(self._pending)
         rows = {name: np.stack([values[name] for values in self._pending]) for name in self._pending[0]}
         if CHECKSUMS in self._shapes:
-            sums = [[checksum(values[name]) for name in self._summed] for values in self._pending]
-            rows[CHECKSUMS] = np.array(sums, dtype=np.uint32)
+            rows[CHECKSUMS] = np.stack([checksums(rows[name]) for name in self._summed], axis=1)
         self._disk.reserve(self._file.id.get_filesize() + growth(self._datasets.values(), self._committed, count))
         try:
             for group in ([name for name in self._shapes if name != "step"], ["step"]):
                 for name in group:
-                    dataset = self._datasets[name]
-                    dataset.resize(count, axis=0)
-                    dataset[self._committed :] = rows[name]
+                    self._datasets[name].write(self._committed, rows[name])
                 self._file.flush()
         except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
@@ -258,10 +255,11 @@ class Recorder:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise DiskError.of(self.path, error) from error
-        self._open(DiskFile(self.path), [*values, CHECKSUMS])
+        self._summed = list(values)
+        self._shapes = {**{name: np.shape(value) for name, value in values.items()}, CHECKSUMS: (len(values),)}
+        if self._keep_open:
+            self._open(DiskFile(self.path), list(self._shapes))
         self._started, self._committed, self._last_commit = True, 1, self._clock()
-        if not self._keep_open:
-            self._release()
 
     def _reopen(self, resume_step: int) -> None:
         """Opens an existing file and cuts it to the frames with step <= resume_step."""
@@ -277,7 +275,7 @@ class Recorder:
         try:
             self._open(disk, names)
             for name in ["step", *(name for name in names if name != "step")]:  # at no moment is a dataset shorter
-                self._datasets[name].resize(self._committed, axis=0)
+                self._datasets[name].cut(self._committed)
                 self._file.flush()
         except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
@@ -292,10 +290,12 @@ class Recorder:
 
         self._disk = disk
         self._file = h5py.File(self.path, "r+", locking=False, libver=FORMAT)
-        self._datasets = {name: self._file[dataset_path(name)] for name in names}
-        self._shapes = {name: tuple(dataset.shape[1:]) for name, dataset in self._datasets.items()}
+        self._datasets = {name: Rows(self._file, name) for name in names}
+        if self._shapes.keys() == self._datasets.keys():
+            return  # opened once more
+        self._shapes = {name: rows.shape for name, rows in self._datasets.items()}
         if CHECKSUMS in self._datasets:
-            self._summed = summed_entries(self._datasets[CHECKSUMS])
+            self._summed = summed_entries(self._file[CHECKSUMS])
 
     def _with_new_parameters(self, disk: DiskFile) -> DiskFile:
         """Replaces the file by a copy with the parameters of this run: they are changed all together or not at all.

@@ -6,7 +6,7 @@ import functools
 import math
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic
 from typing import Any
@@ -17,7 +17,7 @@ from warpflag_kernels.stepping.health import Fault
 from warpflag.base.device import start_warp
 from warpflag.base.progress import Progress
 from warpflag.base.streams import say
-from warpflag.record import RecordError
+from warpflag.record import Frame, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
 from warpflag.run.growth import States, growth
@@ -145,12 +145,7 @@ class Run:
         given = self._given_interval
         saved, interval = monotonic(), _CHECKPOINT_SECONDS if given is None else given
         for block in self.simulation.frame_blocks(watch=look):
-            at_end = {
-                c
-                for frames in block
-                for c, frame in frames.items()
-                if self._guarded(c, lambda c=c, f=frame: self.members[c].write(f))
-            }
+            at_end = self._write(block)
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
             if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):
                 self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
@@ -170,6 +165,23 @@ class Run:
         faults = self.simulation.faults
         self._stop(faults)
         self._complete([c for c, member in enumerate(self.members) if member.outcome is None and c not in faults])
+
+    def _write(self, block: Sequence[Mapping[int, Frame]]) -> set[int]:
+        """Records frames; returns the cells whose last ones were among them."""
+
+        def write(cell: int) -> bool:
+            for frame in (frames[cell] for frames in block if cell in frames):
+                at_end = self._guarded(cell, lambda f=frame: self.members[cell].write(f))
+            return at_end
+
+        return {c for c, at_end in self._of_each({c for frames in block for c in frames}, write) if at_end}
+
+    def _of_each(self, cells: Collection[int], action: Callable[[int], Any]) -> list[tuple[int, Any]]:
+        """What an action on the files of each cell gives, by cell; disks take many at once faster than one by one."""
+        if len(cells) == 1:
+            return [(cell, action(cell)) for cell in cells]
+        with ThreadPoolExecutor(_WRITERS) as pool:
+            return list(zip(cells, pool.map(action, cells), strict=True))
 
     def _complete(self, cells: Sequence[int]) -> None:
         """Ends members that have reached the end of their scenes."""
@@ -233,17 +245,13 @@ class Run:
             self._guarded(cell, close)
 
     def _save(self, cells: Sequence[int]) -> None:
-        """Writes the checkpoints of members that still go on; disks take many at once faster than one by one."""
+        """Writes the checkpoints of members that still go on."""
 
         def save(cell: int) -> None:
             copied = self.simulation.part(self._copy, cell)
             self._guarded(cell, lambda: self.members[cell].save(copied, self.simulation.device.alias))
 
-        if len(cells) == 1:
-            save(cells[0])
-        elif cells:
-            with ThreadPoolExecutor(_WRITERS) as pool:
-                list(pool.map(save, cells))
+        self._of_each(cells, save)
 
     def _first_node(self, cell: int) -> np.ndarray:
         """Where each flagellum of a cell begins in its record, shape [flagellum_count + 1]."""
