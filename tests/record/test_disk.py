@@ -209,6 +209,7 @@ def test_flushed_frames_are_on_the_disk_before_anything_later_is(tmp_path, monke
 def test_a_device_that_can_not_store_frames_is_told(tmp_path, monkeypatch):
     recorder = started(tmp_path / "run.h5")
     recorder.write(frame(0))
+    recorder.write(frame(1))
 
     def broken(_descriptor):
         raise OSError(errno.EIO, "Input/output error")

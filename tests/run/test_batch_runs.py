@@ -11,7 +11,6 @@ import pytest
 
 from tests.runs import arrays, assert_same_frames, frame_by_frame, small, summary
 from warpflag import observables
-from warpflag.observables import cells
 from warpflag.record import Record
 from warpflag.run import run
 from warpflag.run.simulation import Simulation
@@ -157,30 +156,16 @@ def test_measures_of_many_cells_are_those_of_each(counts):
     positions = 0.4 * random.standard_normal(shape) + np.arange(first_node[-1])[:, None] * [0.0, 0.0, 0.02]
     directors = random.standard_normal(shape)
     directors /= np.linalg.norm(directors, axis=-1, keepdims=True)
-    lengths = cells.bundle_lengths(positions, first_node)
+    lengths = observables.bundle_length(positions, first_node)
     assert lengths.tolist() == [observables.bundle_length(x, first_node) for x in positions]
     assert len(counts) == 1 or len(set(lengths)) > 3
     for part in (slice(0, 1), slice(2, 5)):  # the numbers of a cell do not depend on the others
-        assert np.array_equal(cells.bundle_lengths(positions[part], first_node), lengths[part])
+        assert np.array_equal(observables.bundle_length(positions[part], first_node), lengths[part])
     if len(counts) > 1:
-        phases = cells.phase_differences(positions, directors, first_node)
+        phases = observables.phase_difference(positions, directors, first_node)
         each = [observables.phase_difference(x, e1, first_node) for x, e1 in zip(positions, directors, strict=True)]
         np.testing.assert_allclose(phases, each, rtol=1e-14)
-        assert np.array_equal(cells.phase_differences(positions[3:4], directors[3:4], first_node), phases[3:4])
-
-
-def test_speeds_of_many_cells_are_those_of_each():
-    random = np.random.default_rng(1)
-    before, now = random.standard_normal((2, 5, 3))
-    first = random.standard_normal((5, 4))
-    second = first + 0.1 * random.standard_normal((5, 4))
-    speeds = cells.body_speeds(np.full(5, 2e-3), before, now, first, second)
-    times = np.array([0.0, 2e-3])
-    each = [
-        observables.body_speed(times, np.stack(x), np.stack(q))
-        for x, q in zip(zip(before, now, strict=True), zip(first, second, strict=True), strict=True)
-    ]
-    np.testing.assert_allclose(speeds, each, rtol=1e-13)
+        assert np.array_equal(observables.phase_difference(positions[3:4], directors[3:4], first_node), phases[3:4])
 
 
 def test_an_excluded_cell_stays_where_it_is():

@@ -37,12 +37,12 @@ def bundled_nodes(
     *,
     pairs_at_once: int = _PAIRS_AT_ONCE,
 ) -> NDArray[np.bool_]:
-    """Which nodes lie near the segments 1..N of any other flagellum, shape [node_count].
+    """Which nodes lie near the segments 1..N of any other flagellum, shape [..., node_count], of one frame or many.
 
     The distance is the least one from the node to the centre line.
 
     Args:
-        positions: nodes [um], shape [node_count, 3].
+        positions: nodes [um], shape [..., node_count, 3].
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
         distance: up to which a node counts as near [um].
         pairs_at_once: pairs of a node and a segment whose distances are held in memory; changes no result.
@@ -50,22 +50,27 @@ def bundled_nodes(
     Source:
         the paper's bundled portion, "within a distance 2R".
     """
-    nodes: Array = np.asarray(positions, float)
-    nodes = nodes - nodes.mean(axis=0)  # keeps the squares below small far from the origin
+    given: Array = np.asarray(positions, float)
+    nodes = given.reshape(-1, *given.shape[-2:])
+    nodes = nodes - nodes.mean(axis=1, keepdims=True)  # keeps the squares below small far from the origin
     bounds = [int(i) for i in np.asarray(first_node)]
-    bundled = np.zeros(len(nodes), dtype=bool)
-    edges = np.diff(nodes, axis=0)
-    is_segment = np.ones(len(edges), dtype=bool)
+    bundled = np.zeros(nodes.shape[:2], dtype=bool)
+    edges = np.diff(nodes, axis=1)
+    is_segment = np.ones(edges.shape[1], dtype=bool)
     is_segment[np.asarray(bounds[1:-1], dtype=int) - 1] = False  # tip of one, r_0 of the next
     for first, end in pairwise(bounds):
         others = is_segment.copy()
         others[first : end - 1] = False
-        starts, vectors = nodes[:-1][others], edges[others]
-        rows = max(1, pairs_at_once // max(1, len(starts)))
-        for row in range(first, end, rows):
-            stop = min(row + rows, end)
-            bundled[row:stop] = near_segments(nodes[row:stop], starts, vectors, distance)
-    return bundled
+        count = max(1, int(others.sum()))
+        rows = max(1, pairs_at_once // count)
+        frames = max(1, pairs_at_once // (count * min(rows, end - first)))
+        for frame in range(0, len(nodes), frames):
+            block = slice(frame, frame + frames)
+            starts, vectors = nodes[block, :-1][:, others], edges[block][:, others]
+            for row in range(first, end, rows):
+                stop = min(row + rows, end)
+                bundled[block, row:stop] = near_segments(nodes[block, row:stop], starts, vectors, distance)
+    return bundled.reshape(given.shape[:-1])
 
 
 def near_segments(points: Array, starts: Array, vectors: Array, distance: float) -> NDArray[np.bool_]:
@@ -94,14 +99,14 @@ def near_segments(points: Array, starts: Array, vectors: Array, distance: float)
 def bundled_fraction(
     positions: ArrayLike, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
 ) -> Array:
-    """Bundled part of each flagellum as a fraction of its length, shape [flagellum_count].
+    """Bundled part of each flagellum as a fraction of its length, shape [..., flagellum_count], of one frame or many.
 
     The rule: nodes r_0..r_N are scanned from the motor; the index of the last node of the first contiguous
     run of bundled nodes (see `bundled_nodes`), over N; 0 without such a run. The anchors themselves may lie
     outside the distance, so the run need not start at r_0.
 
     Args:
-        positions: nodes [um], shape [node_count, 3].
+        positions: nodes [um], shape [..., node_count, 3].
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
         distance: up to which a node counts as bundled [um].
         gap: contour length that may lie outside the distance without ending the run [um], rounded to whole segments.
@@ -112,30 +117,36 @@ def bundled_fraction(
     bundled = bundled_nodes(positions, first_node, distance)
     fractions = []
     for rows in flagella(first_node):
-        edges = np.diff(positions[rows], axis=0)
-        passed_over = round(gap / float(np.median(np.sqrt(np.vecdot(edges, edges)))))
-        found = np.flatnonzero(bundled[rows])
-        ends = found[:-1][np.diff(found) > passed_over + 1]
-        last = 0 if found.size == 0 else ends[0] if ends.size else found[-1]
-        fractions.append(last / len(edges))
-    return np.array(fractions)
+        edges = np.diff(positions[..., rows, :], axis=-2)
+        passed_over = np.round(gap / np.median(np.sqrt(np.vecdot(edges, edges)), axis=-1, keepdims=True))
+        own, index = bundled[..., rows], np.arange(rows.stop - rows.start)
+        # The next bundled node after each: the least of those behind it.
+        beyond = np.where(own, index, 3 * len(index))[..., ::-1]
+        following = np.minimum.accumulate(beyond, axis=-1)[..., ::-1]
+        following = np.append(following[..., 1:], np.full((*own.shape[:-1], 1), 3 * len(index)), axis=-1)
+        ends = own & ((following - index > passed_over + 1) | (following == 3 * len(index)))
+        fractions.append(ends.argmax(axis=-1) / (len(index) - 1))
+    return np.stack(fractions, axis=-1)
 
 
 def bundle_length(
     positions: ArrayLike, first_node: NDArray[np.integer], distance: float = BUNDLE_DISTANCE, gap: float = 0.0
-) -> float:
-    """Bundle length l_r of one frame in [0, 1]: mean of `bundled_fraction` over the flagella; 0 with one flagellum.
+) -> Array:
+    """Bundle length l_r in [0, 1] of one frame or many: mean of `bundled_fraction` over the flagella; 0 with one.
 
     Args:
-        positions: nodes [um], shape [node_count, 3].
+        positions: nodes [um], shape [..., node_count, 3].
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
         distance: up to which a node counts as bundled [um].
         gap: contour length that may lie outside the distance [um]; records hold l_r with 0, figures take `STRAY`.
 
+    Returns:
+        l_r, shape [...], a number for one frame.
+
     Source:
         the paper, Fig. 3(b), which measures it from the cell body to the bundle front over the axial length.
     """
-    return float(bundled_fraction(positions, first_node, distance, gap).mean())
+    return bundled_fraction(positions, first_node, distance, gap).mean(axis=-1)
 
 
 def zip_time(times: ArrayLike, bundle_lengths: ArrayLike, hold: float = 0.0) -> float:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from warpflag.scene import Scene
 
 __all__ = [
+    "along_axis",
     "body_power",
     "body_rate",
     "body_speed",
@@ -45,7 +46,20 @@ def body_speed(times: ArrayLike, body_positions: ArrayLike, body_orientations: A
         ValueError: fewer than two frames, or times that do not increase.
     """
     duration = elapsed(times)
-    return -float(_along_axis(body_positions, body_orientations)[1].sum()) / duration
+    return -float(_moves(body_positions, body_orientations)[1].sum()) / duration
+
+
+def along_axis(before: Array, now: Array, orientation_before: Array, orientation: Array) -> Array:
+    """Displacements along the mean body axis e_b3 of their ends [um], shape [...]; negative forward.
+
+    Args:
+        before: places of the body at the beginning [um], shape [..., 3].
+        now: the same at the end.
+        orientation_before: quaternions (x, y, z, w) from body to lab at the beginning, shape [..., 4].
+        orientation: the same at the end.
+    """
+    axis = unit(rotations.axis_of_body(orientation_before) + rotations.axis_of_body(orientation))
+    return np.vecdot(now - before, axis)
 
 
 def net_speed(times: ArrayLike, body_positions: ArrayLike) -> float:
@@ -177,7 +191,7 @@ def body_power(times: ArrayLike, body_positions: ArrayLike, body_orientations: A
         ValueError: fewer than two frames, or times that do not increase.
     """
     duration, intervals = elapsed(times), np.diff(np.asarray(times, float))
-    moved, along = _along_axis(body_positions, body_orientations)
+    moved, along = _moves(body_positions, body_orientations)
     turned = _body_turns(body_orientations)
     mobility, work = _mobility(scene), 0.0
     for motion, part, parallel, other in (
@@ -188,11 +202,10 @@ def body_power(times: ArrayLike, body_positions: ArrayLike, body_orientations: A
     return float(np.sum(work) / duration)
 
 
-def _along_axis(body_positions: ArrayLike, body_orientations: ArrayLike) -> tuple[Array, Array]:
+def _moves(body_positions: ArrayLike, body_orientations: ArrayLike) -> tuple[Array, Array]:
     """Displacements from each frame to the next [um], shape [frame_count - 1, 3], and their parts along e_b3."""
-    axes = rotations.axis_of_body(body_orientations)
-    moved = np.diff(np.asarray(body_positions, float), axis=0)
-    return moved, np.vecdot(moved, unit(axes[1:] + axes[:-1]))
+    places, turns = np.asarray(body_positions, float), np.asarray(body_orientations, float)
+    return np.diff(places, axis=0), along_axis(places[:-1], places[1:], turns[:-1], turns[1:])
 
 
 def _body_turns(body_orientations: ArrayLike) -> Array:

@@ -58,20 +58,20 @@ def segment_tangents(positions: ArrayLike) -> Array:
     return edges / np.sqrt(np.vecdot(edges, edges))[..., None]
 
 
-def phase_difference(positions: ArrayLike, directors: ArrayLike, first_node: NDArray[np.integer]) -> float:
-    """Contour-averaged phase difference <theta> in [0, 1] of one frame, mean over all pairs of flagella.
+def phase_difference(positions: ArrayLike, directors: ArrayLike, first_node: NDArray[np.integer]) -> Array:
+    """Contour-averaged phase difference <theta> in [0, 1], mean over all pairs of flagella, of one frame or many.
 
     theta(i) of `local_phase_difference` is averaged over the segments 1..N of a pair (segments are paired by
     their number from the motor; of unequal flagella the common part counts), then over the pairs. Undefined
-    segments are left out.
+    segments are left out. The numbers of a frame do not depend on which others are measured with it.
 
     Args:
-        positions: nodes [um], shape [node_count, 3].
-        directors: e1 of tripod and segments, shape [node_count, 3].
+        positions: nodes [um], shape [..., node_count, 3].
+        directors: e1 of tripod and segments, same shape.
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
 
     Returns:
-        <theta>; NaN where no segment of any pair is defined.
+        <theta>, shape [...], a number for one frame; NaN where no segment of any pair is defined.
 
     Raises:
         ValueError: fewer than two flagella.
@@ -83,19 +83,23 @@ def phase_difference(positions: ArrayLike, directors: ArrayLike, first_node: NDA
     bounds = [int(i) for i in np.asarray(first_node)]
     if len(bounds) < 3:
         raise ValueError("phase_difference needs at least two flagella")
-    lengths = np.diff(bounds) - 1
+    lengths, frames = np.diff(bounds) - 1, positions.shape[:-2]
     # Padded with NaN: ragged flagella broadcast, and the padding drops out with the undefined segments.
-    e1 = np.full((len(lengths), lengths.max(), 3), np.nan)
+    e1 = np.full((*frames, len(lengths), lengths.max(), 3), np.nan)
     tangents = np.full_like(e1, np.nan)
     for k, (first, end) in enumerate(pairwise(bounds)):
-        e1[k, : lengths[k]] = directors[first + 1 : end]
-        tangents[k, : lengths[k]] = segment_tangents(positions[first:end])
-    pair_means = []
+        e1[..., k, : lengths[k], :] = directors[..., first + 1 : end, :]
+        tangents[..., k, : lengths[k], :] = segment_tangents(positions[..., first:end, :])
+    total, pairs = np.zeros(frames), np.zeros(frames)
     for k in range(len(lengths) - 1):
-        theta = local_phase_difference(e1[k], tangents[k], e1[k + 1 :], tangents[k + 1 :])
+        own, others = (
+            (..., slice(k, k + 1), slice(None), slice(None)),
+            (..., slice(k + 1, None), slice(None), slice(None)),
+        )
+        theta = local_phase_difference(e1[own], tangents[own], e1[others], tangents[others])
         defined = ~np.isnan(theta)
         counts = np.count_nonzero(defined, axis=-1)
         sums = np.sum(theta, axis=-1, where=defined)
-        pair_means.append(sums[counts > 0] / counts[counts > 0])
-    means = np.concatenate(pair_means)
-    return float(means.mean()) if means.size else float("nan")
+        total += np.divide(sums, counts, out=np.zeros_like(sums), where=counts > 0).sum(axis=-1)
+        pairs += (counts > 0).sum(axis=-1)
+    return np.divide(total, pairs, out=np.full(frames, np.nan), where=pairs > 0)[()]

@@ -54,8 +54,7 @@ def bundle_lengths(record: Record, gap: float = 0.0) -> Array:
     Raises:
         RecordError: the record can't be read.
     """
-    first_node = record.first_node
-    return np.array([bundle.bundle_length(x, first_node, gap=gap) for x in record.positions[:]])
+    return bundle.bundle_length(record.positions[:], record.first_node, gap=gap)
 
 
 def steric_force_densities(record: Record, rule: Literal["pairs", "nodes", "net"] = "pairs") -> Array:

@@ -117,7 +117,7 @@ def _in_memory(image: bytes | None = None) -> Any:
         image: its bytes; None: it is empty.
     """
     import h5py
-    from h5py import h5f, h5p
+    from h5py import h5f, h5p  # pyright: ignore[reportAttributeAccessIssue]
 
     name = f"record {next(_NUMBERS)}"  # HDF5 takes files of one name for one file, also those of other threads
     if image is None:

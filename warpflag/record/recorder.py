@@ -75,7 +75,7 @@ class Recorder:
         self._datasets: dict[str, Rows] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._summed: list[str] = []  # entries in the order of their checksums
-        self._committed = 0
+        self._committed, self._synced = 0, False
         self._pending: list[dict[str, Any]] = []
         self._last_commit = float("-inf")  # so that the first frame is late
         self._last_step = resume_step
@@ -155,12 +155,15 @@ class Recorder:
         if not self._started:
             return
         self._commit()
+        if self._synced:
+            return
         disk = self._disk or DiskFile(self.path)
         try:
             disk.sync()
         finally:
             if disk is not self._disk:
                 disk.close()
+        self._synced = True
 
     def close(self) -> None:
         """Commits what is pending and closes the file; calling it again does nothing.
@@ -198,7 +201,7 @@ class Recorder:
         except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
             raise DiskError.of(self.path, error) from error
-        self._committed = count
+        self._committed, self._synced = count, False
         self._pending = []
         self._last_commit = self._clock()
         if not self._keep_open:
@@ -259,7 +262,7 @@ class Recorder:
         self._shapes = {**{name: np.shape(value) for name, value in values.items()}, CHECKSUMS: (len(values),)}
         if self._keep_open:
             self._open(DiskFile(self.path), list(self._shapes))
-        self._started, self._committed, self._last_commit = True, 1, self._clock()
+        self._started, self._committed, self._synced, self._last_commit = True, 1, True, self._clock()
 
     def _reopen(self, resume_step: int) -> None:
         """Opens an existing file and cuts it to the frames with step <= resume_step."""

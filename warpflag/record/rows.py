@@ -32,7 +32,7 @@ class Rows:
     """
 
     def __init__(self, file: Any, name: str) -> None:
-        from h5py import h5d
+        from h5py import h5d  # pyright: ignore[reportAttributeAccessIssue]
 
         self._id = h5d.open(file.id, dataset_path(name).encode())
         self.shape: tuple[int, ...] = self._id.shape[1:]
@@ -45,7 +45,7 @@ class Rows:
 
     def write(self, first: int, frames: NDArray[Any]) -> None:
         """Writes frames from number `first` on; the dataset ends with the last of them."""
-        from h5py import h5s
+        from h5py import h5s  # pyright: ignore[reportAttributeAccessIssue]
 
         frames = np.ascontiguousarray(frames, dtype=self.dtype)
         self.cut(first + len(frames))

@@ -13,7 +13,9 @@ import numpy as np
 from warpflag_kernels.stepping import dense_output, frame_slots
 
 from warpflag.model.switching import corners
-from warpflag.observables.cells import body_speeds, bundle_lengths, phase_differences
+from warpflag.observables.bundle import bundle_length
+from warpflag.observables.motion import along_axis
+from warpflag.observables.phase import phase_difference
 from warpflag.record import Frame
 from warpflag.run.cells import Cells, motor_torques
 from warpflag.scene import Scene
@@ -290,8 +292,8 @@ class Frames:
         positions = block.positions[row, nodes]
         measured: dict[str, np.ndarray] = {}
         if len(first_node) > 2:
-            measured["phase_difference"] = phase_differences(positions, block.directors[row, nodes], first_node)
-        measured["bundle_length"] = bundle_lengths(positions, first_node)
+            measured["phase_difference"] = phase_difference(positions, block.directors[row, nodes], first_node)
+        measured["bundle_length"] = bundle_length(positions, first_node)
         measured["elastic_energy"] = block.elastic_energy[m, cells].sum(axis=1)
         if self._drives:
             measured["motor_torque"] = block.motor_torque[row, flagella]
@@ -306,7 +308,7 @@ class Frames:
         turned = block.body_angle[m, cells] - before["body_angle"][m, cells]
         motors_turned = block.motor_angle[row, flagella] - before["motor_angle"][row, flagella]
         return measured | {
-            "body_speed": body_speeds(duration, *at_ends),
+            "body_speed": -along_axis(*at_ends) / duration,
             "body_rate": turned / (2 * np.pi * duration),
             "motor_rate": motors_turned / (2 * np.pi * duration[:, None]),
         }

@@ -22,7 +22,7 @@ from warpflag.run import checkpoint
 from warpflag.run.faults import NumericalError
 from warpflag.run.growth import growth_words
 from warpflag.run.lock import Lock
-from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, sync, write_whole
+from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, write_whole
 from warpflag.run.stop import Ended
 from warpflag.run.summary import digest, kept_words, plain
 from warpflag.scene import Scene
@@ -117,7 +117,6 @@ class Member:
             "versions": versions(),
         }
         self.recorder.flush()
-        sync(self.recorder.path)
         checkpoint.save(self.directory, arrays, meta)
         self._saved_step = step
 

@@ -6,7 +6,6 @@ import contextlib
 import errno
 import hashlib
 import itertools
-import os
 import re
 from pathlib import Path
 
@@ -24,7 +23,6 @@ __all__ = [
     "claim_directory",
     "dynamics_sha256",
     "recorded_scene",
-    "sync",
     "text_sha256",
     "write_whole",
 ]
@@ -84,15 +82,6 @@ def write_whole(path: Path, text: str) -> None:
     """Writes a text file that is whole or absent."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def sync(path: Path) -> None:
-    """Brings what was written of a file to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def dynamics_sha256(scene: Scene) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpflag.observables.cells import bundle_lengths, phase_differences
+from warpflag.observables import bundle_length, phase_difference
 from warpflag.run.simulation import Simulation
 
 __all__ = ["Needed", "needed"]
@@ -84,8 +84,8 @@ def _observing(simulation: Simulation) -> float:
     positions, directors = np.tile(state.positions, many), np.tile(state.directors, many)
     began = time.process_time()
     if len(first_node) > 2:
-        phase_differences(positions, directors, first_node)
-    bundle_lengths(positions, first_node)
+        phase_difference(positions, directors, first_node)
+    bundle_length(positions, first_node)
     return (time.process_time() - began) / _FRAMES_OBSERVED
 
 
