@@ -1,4 +1,4 @@
-"""The whole attack on this program: kills, write limits, damaged files, malformed scenes, random scenes, extremes.
+"""The whole attack on this program: kills, signals, write limits, damage, malformed scenes, random scenes, extremes.
 
     uv run examples/reliability/attack.py                          everything: hours on one core
     uv run examples/reliability/attack.py --minutes 20 --seed 7    as much as fits, every kind in turn
@@ -23,11 +23,12 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent.parent))
 
-from examples.reliability import extremes, runs, scenes
+from examples.reliability import extremes, runs, scenes, signals
 from examples.reliability.attempt import OUTCOMES, Found, found
 
 COUNTS = {
     "kills": 200,
+    "signals": 200,
     "limits": 40,
     "damage": 300,
     "malformed": 500,
@@ -66,6 +67,7 @@ class Attack:
         seed = 100_000 * self.seed + number
         actions: dict[str, Callable[[], Found]] = {
             "kills": lambda: runs.kill(self.base, seed, scratch),
+            "signals": lambda: signals.signalled(self.base, seed, scratch),
             "limits": lambda: runs.limit(self.base, seed, scratch),
             "damage": lambda: runs.damage(self.base, seed, scratch),
             "malformed": lambda: scenes.malformed_scene(seed, scratch),

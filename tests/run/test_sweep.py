@@ -19,7 +19,9 @@ from tests.runs import arrays, assert_same_frames, executed, small, summary
 from warpflag.record import Record
 from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
+from warpflag.run.stop import Stop
 from warpflag.run.sweep import Sweep
+from warpflag.run.sweep.sweep import SweepRun
 from warpflag.scene import dumps
 
 BASE = {"duration": 4e-5, "frames": 4, "flagella.length": 1.0}
@@ -119,6 +121,35 @@ def test_a_member_whose_files_are_damaged_is_reported_and_the_rest_done(tmp_path
     outcome = sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
     assert outcome.status == "failed" and "2 done" in outcome.message
     assert [row["status"] for row in rows(tmp_path / "out")] == ["done", "done", "begun"]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that plays a full disk")
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_member_whose_disk_is_full_is_told_in_one_line_and_the_rest_done(tmp_path, capsys, monkeypatch, alone):
+    if alone:
+        monkeypatch.setattr(SweepRun, "_batch_size", lambda *_: 1)
+    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+    full = tmp_path / "out" / "0001" / "run.h5.tmp"
+    full.parent.mkdir()
+    full.symlink_to("/dev/full")
+    outcome = started.execute(workers=1, stop=Stop())
+    told = [line for line in capsys.readouterr().err.splitlines() if "0001:" in line]
+    assert len(told) == 1 and "No space left on device" in told[0] and "resumable with --resume" in told[0]
+    assert outcome.status == "failed" and "2 done, 1 begun" in outcome.message
+    assert [row["status"] for row in rows(tmp_path / "out")] == ["done", "begun", "done"]
+    full.unlink(missing_ok=True)
+    assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
+    for k, member in enumerate(started.members):
+        assert_same_frames(executed(member.scene, tmp_path / f"alone-{k}"), tmp_path / "out" / f"{k:04d}")
+
+
+def test_a_folder_that_takes_no_files_is_told_in_one_line_and_the_rest_done(tmp_path, capsys):
+    """What root may write anywhere stands in for a read-only folder: a file where the folder should be."""
+    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+    (tmp_path / "out" / "0001").touch()
+    outcome = started.execute(workers=1, stop=Stop())
+    told = [line for line in capsys.readouterr().err.splitlines() if "0001" in line]
+    assert len(told) == 1 and outcome.status == "failed" and "2 done" in outcome.message
 
 
 def test_a_member_of_another_scene_is_refused(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -9,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,6 +26,19 @@ _SECONDS_PER_LOOK = 0.1
 _COMMAND = [sys.executable, "-m", "warpflag.run.sweep.worker"]
 # A worker is one process of one thread; the libraries below NumPy would start one per core in each.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Processes that are started meanwhile begin with SIGINT blocked, on systems that can."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @dataclass(frozen=True)
@@ -51,16 +65,18 @@ class _Worker:
         self._started()
 
     def _started(self) -> None:
-        # In a session of its own: Ctrl-C reaches the sweep alone, which then ends its workers in order.
-        self.process = subprocess.Popen(
-            _COMMAND,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
-            env={**_ONE_THREAD, **os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
-            start_new_session=True,
-        )
+        # In a session of its own: Ctrl-C reaches the sweep alone, which then ends its workers in order. An interrupt
+        # waits until the worker can take it: Python would answer it with a traceback before.
+        with _interrupts_blocked():
+            self.process = subprocess.Popen(
+                _COMMAND,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                encoding="utf-8",
+                env={**_ONE_THREAD, **os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                start_new_session=True,
+            )
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
         """The answer to a request; {"outcomes": None} where the process has ended."""

@@ -36,6 +36,9 @@ _FIRST_PART = 64  # of the simulated time is what is timed first
 
 def main() -> None:
     """Answers requests until the input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # between batches it ends the process without a word
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print does not get between the answers
     requests: queue.Queue[dict[str, Any] | None] = queue.Queue()

@@ -1,0 +1,86 @@
+"""Attacks on runs and sweeps by the signals that ask them to end: they end resumable, and resumed as if undisturbed."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from examples.reliability.attempt import PATIENCE, Found, command, found, frames_of, problem, same, told
+from examples.reliability.runs import CHECKPOINTS, Base
+
+NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGXCPU, signal.SIGINT)
+SWEEP = """
+base = "{base}"
+[axes]
+"motor.torque" = [1.5, 2.0, 2.5, 3.0]
+"""
+OPTIONS = ("--workers", "1", *CHECKPOINTS)
+_SECONDS_LIVES = 1.05  # of the undisturbed wall time, within which the signal comes
+
+
+def _undisturbed(base: Base) -> tuple[Path, float]:
+    """A sweep that nobody disturbs, made once, and the wall time that it takes now [s]."""
+    plan, whole = base.folder / "signals.toml", base.folder / "swept"
+    timed = base.folder / "swept.seconds"
+    if not timed.exists():
+        plan.write_text(SWEEP.format(base=base.scene))
+        begin = time.monotonic()
+        ended = command("sweep", str(plan), "-o", str(whole), *OPTIONS)
+        assert ended.returncode == 0, ended.stderr
+        timed.write_text(f"{time.monotonic() - begin}")
+    return whole, float(timed.read_text())
+
+
+def signalled(base: Base, seed: int, folder: Path) -> Found:
+    """A run or a sweep gets one signal at a random moment of its life, is resumed, and compared to the last bit."""
+    chance, directory = random.Random(f"signal {seed}"), folder / "signalled"
+    number, swept = NUMBERS[seed % len(NUMBERS)], seed // len(NUMBERS) % 2 == 1
+    whole, seconds = _undisturbed(base) if swept else (base.whole, base.seconds)
+    what = ("sweep", str(base.folder / "signals.toml"), *OPTIONS) if swept else ("run", str(base.scene), *CHECKPOINTS)
+    after = chance.random() * seconds * _SECONDS_LIVES
+    line = [sys.executable, "-m", "warpflag", *what, "-o", str(directory)]
+    process = subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    time.sleep(after)
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return found("traceback", f"{what[0]}: {number.name} after {after:.2f} s: goes on")
+    done = f"{what[0]}: {number.name} after {after:.2f} of {seconds:.2f} s, status {process.returncode}"
+    begun = (directory / ("sweep.toml" if swept else "scene.toml")).exists()
+    # Before the program has taken signals over they act as on any process, and nothing has begun.
+    if not begun and (process.returncode == -number or "KeyboardInterrupt" in said):
+        return found("right", f"{done}: before the program began")
+    if process.returncode < 0 or "Traceback" in said:
+        return found("traceback", f"{done}: {said.strip().splitlines()[-1:]}")
+    if process.returncode not in (0, 130 if number == signal.SIGINT else 143):
+        return found("wrong", f"{done}: {said[-200:]}")
+    if not begun:
+        return found("right", f"{done}: nothing was begun")
+    if not process.returncode == 0:
+        ended = command(what[0], "--resume", str(directory), *(("--workers", "1") if swept else ()))
+        if wrong := problem(ended):
+            return found("traceback", f"{done}: resume {wrong}")
+        if ended.returncode:
+            return found("lost", f"{done}: resume ends {ended.returncode}: {told(ended)}")
+    return _compared(whole, directory, swept, done)
+
+
+def _compared(whole: Path, directory: Path, swept: bool, done: str) -> Found:
+    names = [path.name for path in sorted(whole.glob("0*"))] if swept else ["."]
+    differ = [name for name in names if not same(frames_of(directory / name), frames_of(whole / name))]
+    if differ:
+        return found("wrong", f"{done}: other numbers in {' '.join(differ)}")
+    if swept and _table(directory) != _table(whole):
+        return found("wrong", f"{done}: another table")
+    return found("right", done)
+
+
+def _table(directory: Path) -> list[str]:
+    return (directory / "table.csv").read_text().splitlines()
