@@ -63,7 +63,7 @@ def signalled(base: Base, seed: int, folder: Path) -> Found:
         return found("wrong", f"{done}: {said[-200:]}")
     if not begun:
         return found("right", f"{done}: nothing was begun")
-    if not process.returncode == 0:
+    if process.returncode != 0:
         ended = command(what[0], "--resume", str(directory), *(("--workers", "1") if swept else ()))
         if wrong := problem(ended):
             return found("traceback", f"{done}: resume {wrong}")
