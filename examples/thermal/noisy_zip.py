@@ -1,13 +1,17 @@
 """The spread of zip times over seeds of thermal noise, at three torques.
 
-    uv run --extra plot examples/thermal/noisy_zip.py --seeds 64 -o noisy_zip.png
+    uv run --extra plot examples/thermal/noisy_zip.py --seeds 64 -o noisy_zip.png --times noisy_zip.csv
+    uv run --extra plot examples/thermal/noisy_zip.py --from noisy_zip.csv -o noisy_zip.png      # the picture alone
 
-A batch per torque; steps of 2 to 5 us. Without an output no picture is drawn.
+A batch per torque, whose cells leave it when their bundle is complete; steps of 2 to 5 us. Beside them the zip time
+without noise. Without an output no picture is drawn.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -15,54 +19,107 @@ import numpy as np
 import warpflag
 from warpflag import Simulation, observables, with_values
 
-# Torque [pN um], duration and step [s].
-RUNS = ((3.4, 0.015, 2e-6), (1.0, 0.06, 5e-6), (0.5, 0.1, 5e-6))
+# Torque [pN um], duration, step, and interval of the looks [s].
+RUNS = ((3.4, 0.015, 2e-6, 5e-5), (1.0, 0.08, 5e-6, 1e-4), (0.5, 0.6, 5e-6, 5e-4))
 SCENE = Path(__file__).parent.parent / "noisy_zip.toml"
+COLUMNS = ("torque [pN um]", "seed", "zipped [ms]")
+QUIET = -1  # in place of a seed: without noise
 
 
-def zip_times(torque: float, duration: float, step: float, seeds: int) -> np.ndarray:
-    """When each cell's bundle is complete first [s], NaN where it is not within the duration."""
-    values = {"motor.torque": torque, "duration": duration, "frames": 200, "numerics.time_step": step}
-    base = with_values(warpflag.load(SCENE), values)
-    found = np.full(seeds, np.nan)
-    sim = Simulation([with_values(base, {"fluid.seed": i}) for i in range(seeds)], device="cpu")
-    for frames in sim.cell_frames():
-        for cell, frame in frames.items():
+def zip_times(torque: float, duration: float, step: float, interval: float, seeds: int, first: int) -> np.ndarray:
+    """When each cell's bundle is complete first [s], NaN where it is not within the duration; no seeds: one cell
+    without noise, in steps under control."""
+    frames = round(duration / interval)
+    base = with_values(warpflag.load(SCENE), {"motor.torque": torque, "duration": duration, "frames": frames})
+    if seeds:
+        noisy = with_values(base, {"numerics.time_step": step})
+        sim = Simulation([with_values(noisy, {"fluid.seed": first + i}) for i in range(seeds)], device="cpu")
+    else:
+        sim = Simulation([with_values(base, {"fluid.temperature": 0.0, "numerics.time_step": None})], device="cpu")
+    found = np.full(max(seeds, 1), np.nan)
+    for looks in sim.cell_frames():
+        for cell, frame in looks.items():
             if np.isnan(found[cell]) and frame.observables["bundle_length"] >= observables.ZIPPED:
                 found[cell] = frame.time
                 sim.exclude(cell)
     for cell, fault in sim.faults.items():
-        print(f"  seed {cell}: {fault}")
+        print(f"  seed {first + cell}: {fault}")
     return found
+
+
+def simulated(seeds: int, first: int) -> dict[float, tuple[np.ndarray, float]]:
+    """Zip times [ms] of all seeds and without noise, by torque."""
+    found = {}
+    for torque, duration, step, interval in RUNS:
+        times = 1e3 * zip_times(torque, duration, step, interval, seeds, first)
+        quiet = 1e3 * float(zip_times(torque, duration, step, interval, 0, 0)[0])
+        found[torque] = times, quiet
+        tell(torque, 1e3 * duration, times, quiet)
+    return found
+
+
+def tell(torque: float, duration: float, times: np.ndarray, quiet: float) -> None:
+    """A line: mean and its standard error, spread, and the cell without noise; all in ms."""
+    done = times[np.isfinite(times)]
+    line = f"{torque} pN um: {len(done)} of {len(times)} zipped within {duration:g} ms"
+    if len(done) > 1:
+        spread = done.std(ddof=1)
+        line += f"; mean {done.mean():.2f} ± {spread / math.sqrt(len(done)):.2f}, spread {spread:.2f}"
+        line += f" ± {spread / math.sqrt(2 * len(done) - 2):.2f}, from {done.min():.2f} to {done.max():.2f}"
+    line += f"; without noise {quiet:.2f}" if math.isfinite(quiet) else "; without noise not at all"
+    print(line, flush=True)
+
+
+def draw(found: dict[float, tuple[np.ndarray, float]], output: str) -> None:
+    """Shares of cells that have zipped against time, with standard errors of the binomial distribution."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 3.8), layout="constrained")
+    for torque, (times, quiet) in found.items():
+        done = np.sort(times[np.isfinite(times)])
+        share = np.arange(1, len(done) + 1) / len(times)
+        error = np.sqrt(share * (1 - share) / len(times))
+        (line,) = axes.step(done, share, where="post", label=f"{torque} pN µm")
+        axes.fill_between(done, share - error, share + error, step="post", color=line.get_color(), alpha=0.25, lw=0)
+        if math.isfinite(quiet):
+            axes.axvline(quiet, color=line.get_color(), ls="--", lw=1)
+    axes.plot([], [], color="0.4", ls="--", lw=1, label="without noise")
+    axes.set(xlabel="time [ms]", ylabel="share of cells that have zipped", xscale="log", ylim=(0, 1.02))
+    marks = [5, 7, 10, 20, 30, 50, 100, 200, 400]
+    axes.set_xticks(marks, [str(m) for m in marks])
+    axes.minorticks_off()
+    axes.legend(loc="lower right")
+    figure.savefig(output, dpi=150)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=64)
-    parser.add_argument("-o", "--output")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--times", help="CSV file for the zip times")
+    parser.add_argument("--from", dest="source", help="such a file, instead of runs")
+    parser.add_argument("-o", "--output", help="picture")
     chosen = parser.parse_args()
-    times = {}
-    for torque, duration, step in RUNS:
-        times[torque] = 1e3 * zip_times(torque, duration, step, chosen.seeds)
-        done = times[torque][np.isfinite(times[torque])]
-        spread = (
-            f"{done.mean():.2f} ± {done.std(ddof=1):.2f} ms, {done.min():.2f} to {done.max():.2f}"
-            if len(done) > 1
-            else ""
-        )
-        print(
-            f"{torque} pN um: {len(done)} of {chosen.seeds} zipped within {1e3 * duration:g} ms; {spread}", flush=True
-        )
+    if chosen.source:
+        with open(chosen.source, newline="") as file:
+            rows = [[float(x) for x in row] for row in list(csv.reader(file))[1:]]
+        found = {}
+        for torque, duration, *_ in RUNS:
+            times = np.array([t for own, seed, t in rows if own == torque and seed != QUIET])
+            quiet = next(t for own, seed, t in rows if own == torque and seed == QUIET)
+            found[torque] = times, quiet
+            tell(torque, 1e3 * duration, times, quiet)
+    else:
+        found = simulated(chosen.seeds, chosen.first)
+    if chosen.times:
+        with open(chosen.times, "w", newline="") as file:
+            out = csv.writer(file)
+            out.writerow(COLUMNS)
+            for torque, (times, quiet) in found.items():
+                out.writerow([torque, QUIET, f"{quiet:.3f}"])
+                out.writerows([torque, chosen.first + i, f"{t:.3f}"] for i, t in enumerate(times))
     if chosen.output:
-        import matplotlib.pyplot as plt
-
-        figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
-        for torque, found in times.items():
-            done = np.sort(found[np.isfinite(found)])
-            axes.step(done, np.arange(1, len(done) + 1) / len(found), where="post", label=f"{torque} pN µm")
-        axes.set(xlabel="time [ms]", ylabel="share of cells that have zipped", xscale="log", ylim=(0, 1))
-        axes.legend()
-        figure.savefig(chosen.output, dpi=150)
+        draw(found, chosen.output)
 
 
 if __name__ == "__main__":
