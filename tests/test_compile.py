@@ -109,13 +109,14 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole |= launched(monkeypatch, precision, "implicit", CROWD)
     whole |= set().union(*(launched(monkeypatch, precision, stepper, WARM) for stepper in ("implicit", "euler")))
     whole |= launched(monkeypatch, precision, "implicit", {**WARM, "fluid.noise_tolerance": 1e-3})
+    whole |= launched(monkeypatch, precision, "implicit", {**WARM, **SWITCHES["body flow"]})
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     free = {"body.enabled": False, "flagella.count": 1, "fluid.temperature": 300.0}
     reduced |= launched(monkeypatch, precision, "implicit", free)
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)
-    on_cpu |= launched(monkeypatch, precision, "implicit", WARM, by_cells=True)
+    on_cpu |= launched(monkeypatch, precision, "implicit", {**WARM, **SWITCHES["body flow"]}, by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "implicit", SWITCHES["body flow"], by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "rkc", SWITCHES["body flow"], by_cells=True)
     used = {(Path(kernel.adj.filename).name, kernel.func.__name__) for kernel in whole | reduced | once | on_cpu}

@@ -68,6 +68,14 @@ def test_energies_are_those_of_boltzmann(step, count, mode, hook, precision, dev
     assert np.all(abs(mean - 1) < ERRORS * error)
 
 
+def test_with_flow_round_the_body(device):
+    values = {"numerics.time_step": 1e-5, "hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": True}
+    sim, scene = ensemble({**values, "hydrodynamics.body_beads": 30}, "float64", 64, device)
+    mean, error = mean_energies(sim, scene, 2e-4, 2e-5, 30)
+    assert np.all(error < 0.03)
+    assert np.all(abs(mean - 1) < ERRORS * error)
+
+
 @pytest.mark.parametrize("mode", ["none", "all"])
 def test_a_free_filament_has_them_too(mode, device):
     values = {"numerics.time_step": 1e-5, "flagella.count": 1, "hydrodynamics.mode": mode, "body.enabled": False}
@@ -114,6 +122,7 @@ def test_goes_on_with_the_same_bits(stepper, precision, device):
     """After a checkpoint, in a batch of another size, without captured passes; another seed gives another run."""
     step = 2e-6 if stepper == "implicit" else 4e-9
     warm = {"fluid.temperature": 300.0, "fluid.seed": 5, "numerics.stepper": stepper, "numerics.time_step": step}
+    warm |= {"hydrodynamics.body_flow": stepper == "implicit", "hydrodynamics.body_beads": 30}
     scene = touching_cell({"flagella.length": 1.2, **warm}, precision)
     whole = Simulation(scene, device=device, strict=True)
     whole.advance(20 * step)

@@ -174,7 +174,7 @@ class Scene(Section, key=""):
         """Whether the flow round the body is part of the model: as the scene says, else wherever it can be."""
         if self.hydrodynamics.body_flow is not None:
             return self.hydrodynamics.body_flow
-        return self.hydrodynamics.mode in ("all", "consistent") and self.body.enabled and not self.fluid.temperature
+        return self.hydrodynamics.mode in ("all", "consistent") and self.body.enabled
 
     def _check_flows(self) -> None:
         radius, mode = self.hydrodynamics.pair_radius, self.hydrodynamics.mode
@@ -211,8 +211,6 @@ class Scene(Section, key=""):
         if mode in ("between", "as_printed"):
             problem = f"must be none, within, all or consistent with {key}: its mobility is not positive definite"
             raise SceneError("hydrodynamics.mode", mode, problem, related)
-        if self.hydrodynamics.body_flow:
-            raise SceneError("hydrodynamics.body_flow", True, f"takes no {key} yet", related)
         if numerics.stepper == "rkc":
             raise SceneError("numerics.stepper", "rkc", f"takes no {key}; implicit and euler do", related)
         if numerics.accuracy is not None:

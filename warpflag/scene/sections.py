@@ -256,7 +256,7 @@ class Hydrodynamics(Section, key="hydrodynamics"):
     body_flow: bool | None = switch(
         None,
         "the body's surface obstructs the flow of the flagella and carries fluid along; with all and consistent",
-        derived="true where it can be: with all and consistent, a body, and no temperature",
+        derived="true where it can be: with all and consistent, and a body",
     )
     body_beads: int = integer(
         60, 20, 2000, "beads of the body's surface with body_flow; the more, the better the flow beside the body"

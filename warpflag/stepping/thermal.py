@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
+from warpflag_kernels.base.types import DeviceModel, DeviceState
 from warpflag_kernels.contact import contact_list, search
-from warpflag_kernels.fluid import body, lanczos, node_velocity, noise
+from warpflag_kernels.fluid import body, body_noise, lanczos, node_velocity, noise
 from warpflag_kernels.implicit import (
     block_band,
     contact_solve,
@@ -121,7 +122,7 @@ class ThermalStepper:
         reconstruction.reconstruct(model, state, s.chart)
         noise.draw_local(model, state, s.control, self.noise)
         if explicit:
-            self._draw_pairs()
+            self._draw_flows(in_single=False)
             launch_right_hand_side(model, state)
         else:
             self._evaluate()
@@ -140,10 +141,35 @@ class ThermalStepper:
         equilibrium.finish_step(model, state, parts, explicit)
         clock.count_pass(s.control, model.device)
 
-    def _draw_pairs(self, velocities: Any = node_velocity.node_velocities) -> None:
+    def _draw_flows(self, in_single: bool) -> None:
+        """Thermal velocities of the pair sum, and of the flow round the body, at the pose of the step's start.
+
+        Args:
+            in_single: whether products are made in single precision, with the coefficients stored for the step.
+        """
         s = self._system
-        if self._flows:
-            lanczos.draw_pairs(s.model, s.state, s.control, self.noise, self.lanczos, velocities)
+        model, state = s.model, s.state
+        if not self._flows:
+            return
+        around = model.switches.flows.body
+        pair = model.precision.single if in_single else model.plan.pair_precision
+        shell = self.flow.shell if in_single else state.shell
+
+        def velocities(model: DeviceModel, state: DeviceState) -> None:
+            if around:
+                body.obstruct(model, state, shell if in_single else None)
+            if in_single:
+                step_flow.single_velocities(model, state, self.flow)
+            else:
+                node_velocity.node_velocities(model, state)
+
+        if around:
+            body_noise.hold_bodies(model, state)
+        lanczos.draw_pairs(model, state, s.control, self.noise, self.lanczos, velocities)
+        if around:
+            body_noise.carry(model, state, self.noise, shell, pair)
+            body_noise.draw_probe(model, state, self.noise, s.control.steps)
+            body_noise.add_divergence(model, state, s.chart, self.noise)
 
     def _evaluate(self) -> None:
         """Thermal velocities, contacts, forces with the random elastic ones, and velocities, where the step starts."""
@@ -154,10 +180,7 @@ class ThermalStepper:
             contact_solve.warm_start(model, state, self._no_share, self._x, parts.contacts, parts.law)
         if self._flows:
             step_flow.build(model, state, self.flow, parts.contacts if self._touching else None)
-        if step_flow.stores_pairs(model):
-            self._draw_pairs(lambda model, state: step_flow.single_velocities(model, state, self.flow))
-        else:
-            self._draw_pairs()
+        self._draw_flows(in_single=step_flow.stores_pairs(model))
         for term in self._smooth_terms:
             if term.launch is not None:
                 term.launch(model, state)

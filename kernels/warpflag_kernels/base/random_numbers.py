@@ -15,7 +15,7 @@ from warpflag_kernels.base.precision import Precision
 ROUNDS = 10
 _MULTIPLIERS, _WEYL = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85)  # of the paper above
 # What a number is for: fourth word of the counter.
-NODE, PAIRS, STRAIN, BODY_SHIFT, BODY_TURN, CONTACT, HOOK = range(7)
+NODE, PAIRS, STRAIN, BODY_SHIFT, BODY_TURN, CONTACT, HOOK, PROBE, PROBE_SHIFT, PROBE_TURN = range(10)
 
 
 @functools.cache

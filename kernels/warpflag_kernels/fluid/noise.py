@@ -13,13 +13,15 @@ divergence. At a node between segments e and f of tangents t_e, t_f and lengths 
     kT (mobility_along - mobility_across) [tr(G) t + G t],
     G = (1 - t t) [(1 - t_e t_e)/l_e - (1 - t_f t_f)/l_f]/|t_e + t_f|,
 
-and 2 t/l in the bracket at the last node, -2 t/l at the r_0 of a free filament, which is stored as the body.
+and 2 t/l in the bracket at the last node, -2 t/l at the r_0 of a free filament, which is stored as the body. With flow
+round the body there is more, see `body_noise`.
 """
 
 import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpflag_kernels.base import random_numbers
@@ -30,7 +32,7 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 @functools.cache
 def struct(p: Precision) -> Any:
     """The struct `Noise`: settings of every cell, and the thermal velocities of the present step."""
-    vec4, vec6 = p.vec4, wp.types.vector(6, p.real)
+    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
 
     @wp.struct
     class Noise:
@@ -38,6 +40,11 @@ def struct(p: Precision) -> Any:
         seed: wp.array(dtype=wp.uint64)  # [C]
         node: wp.array(dtype=vec4)  # [E], of the node [um/s] and of the spin [rad/s]
         body: wp.array(dtype=vec6)  # [C] [um/s] and [rad/s]
+        # Only with flow round the body.
+        body_root: wp.array(dtype=real)  # [36 C], root of the shell's mobility in body axes, row after row
+        probe: wp.array(dtype=vec3)  # [E], deviates W of nodes, by which the divergence is found
+        probe_shift: wp.array(dtype=vec3)  # [C], of the body's motion
+        probe_turn: wp.array(dtype=vec3)  # [C]
 
     return Noise
 
@@ -55,6 +62,12 @@ def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
     n.seed = wp.array(seeds, dtype=wp.uint64, device=device)
     n.node = wp.zeros(model.element_count, dtype=p.vec4, device=device)
     n.body = wp.zeros(model.cell_count, dtype=wp.types.vector(6, p.real), device=device)
+    if model.switches.flows.body:
+        values, vectors = np.linalg.eigh(model.data.body.shell_mobility.numpy().reshape(-1, 6, 6).astype(np.float64))
+        roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+        n.body_root = wp.array(roots.ravel(), dtype=p.real, device=device)
+        n.probe = wp.zeros(model.element_count, dtype=p.vec3, device=device)
+        n.probe_shift, n.probe_turn = (wp.zeros(model.cell_count, dtype=p.vec3, device=device) for _ in range(2))
     return n
 
 
@@ -116,7 +129,7 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: bool, free: bool) -> SimpleNamespace:
+def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamespace:
     real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
     Model, State, Noise = structs(p).Model, structs(p).State, struct(p)
     normals = random_numbers.functions(p).normals
@@ -126,7 +139,8 @@ def _kernels(p: Precision, pairs: bool, free: bool) -> SimpleNamespace:
     for_node, for_shift, for_turn = (
         wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
     )
-    module = p.module("noise", ("pairs" if pairs else "") + ("free" if free else ""))
+    names = "pairs" * pairs + "free" * free + "_shell" * shell
+    module = p.module("noise", names)
 
     @wp.kernel(module=module)
     def elements(
@@ -179,6 +193,18 @@ def _kernels(p: Precision, pairs: bool, free: bool) -> SimpleNamespace:
         scale = real(wp.sqrt(wp.float64(2.0) * noise.energy[c] / step[c]))
         a = normals(noise.seed[c], 0, steps[c], for_shift)
         b = normals(noise.seed[c], 0, steps[c], for_turn)
+        if wp.static(shell):
+            q = state.pose.body_orientation[c]
+            axes = wp.quat_to_matrix(p.quat(real(q[0]), real(q[1]), real(q[2]), real(q[3])))
+            xi = vec6(a[0], a[1], a[2], b[0], b[1], b[2])
+            found = vec6(zero)
+            for i in range(6):
+                for j in range(6):
+                    found[i] += noise.body_root[36 * c + 6 * i + j] * xi[j]
+            shift = scale * (axes * vec3(found[0], found[1], found[2]))
+            turn = scale * (axes * vec3(found[3], found[4], found[5]))
+            noise.body[c] = vec6(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+            return
         axis = state.pose.body_axis[c]
         body = model.body
         along = body.mobility_along[c]
@@ -206,7 +232,8 @@ def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any)
         control: struct `Control`, with the step that begins and its number.
         noise: struct `Noise`.
     """
-    kernels = _kernels(model.precision, model.switches.pairs != "none", model.switches.has("free end"))
+    switches = model.switches
+    kernels = _kernels(model.precision, switches.pairs != "none", switches.has("free end"), switches.flows.body)
     inputs = [model.data, state.data, control.step, control.steps, noise]
     wp.launch(kernels.elements, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.bodies, model.cell_count, inputs=inputs, device=model.device)
