@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from warpflag_kernels.fluid import body_noise
 
 from tests.helpers import displaced, free_nodes, matrix, shaken, touching_cell
@@ -117,7 +116,7 @@ def test_velocities_have_the_covariance_of_the_whole_mobility(device):
 
 
 def test_the_finite_difference_is_the_divergence(precision, device):
-    """It is a square form of its deviates: its values at all unit vectors add up to kT div M, of nodes and body, without
+    """It is a square form of its deviates: its values at all unit vectors add up to kT div M, of nodes and body, less
     the part of the local mobility, which has a closed form."""
     scene = small_cell(precision)
     start, nodes = shaken(scene, 3, node=0.002), free_nodes(small_cell(precision))

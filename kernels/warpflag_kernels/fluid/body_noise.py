@@ -5,9 +5,9 @@ and body that a moving body causes, C^T M_c^-1 K for the nodes and 1 for itself,
 
     M = S + [R - C^T M_c^-1 C] + P N_b P^T.
 
-The first bracket is the mobility of nodes beside a body that is held: Lanczos' process has it for R (`held_velocities`).
-The root of the other is P N_b^1/2, N_b a constant matrix of six rows in body axes: the body moves at random and carries
-the nodes along (`carry`). So fluctuation and dissipation fit exactly.
+The bracket is the mobility of nodes beside a body that is held; Lanczos' process draws it in place of R. The root of the
+last part is P N_b^1/2, N_b a constant matrix of six rows in body axes: the body moves at random and carries the nodes
+along (`carry`). So fluctuation and dissipation fit exactly.
 
 Both parts depend on the nodes' places about the body, so M has a divergence beside that of the local part. It is found
 by a random finite difference (Delong, Usabiaga, Delgado-Buscalioni, Griffith & Donev, J. Chem. Phys. 140, 134110
@@ -34,8 +34,8 @@ from warpflag_kernels.fluid import shell as shell_stage
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod import rotations
 
-# d of the finite difference [um, rad]. It leaves d^2/8 of the third derivative: 6e-4 of the drift of a node 0.05 um from
-# the body. Round-off leaves 1e-6 um/d = 1e-3 in float32.
+# d of the finite difference [um, rad]. It leaves d^2/8 of the third derivative: 6e-4 of the drift of a node 0.05 um
+# from the body. Round-off leaves 1e-6 um/d = 1e-3 in float32.
 DISPLACEMENT = 1.0e-3
 
 
