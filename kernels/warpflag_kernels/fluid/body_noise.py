@@ -5,9 +5,9 @@ and body that a moving body causes, C^T M_c^-1 K for the nodes and 1 for itself,
 
     M = S + [R - C^T M_c^-1 C] + P N_b P^T.
 
-The bracket is the mobility of nodes beside a body that is held; Lanczos' process draws it in place of R. The root of the
-last part is P N_b^1/2, N_b a constant matrix of six rows in body axes: the body moves at random and carries the nodes
-along (`carry`). So fluctuation and dissipation fit exactly.
+The bracket is the mobility of nodes beside a body that is held; Lanczos' process draws it in place of R. The root of
+the last part is P N_b^1/2, N_b a constant matrix of six rows in body axes: the body moves at random and carries the
+nodes along (`carry`). So fluctuation and dissipation fit exactly.
 
 Both parts depend on the nodes' places about the body, so M has a divergence beside that of the local part. It is found
 by a random finite difference (Delong, Usabiaga, Delgado-Buscalioni, Griffith & Donev, J. Chem. Phys. 140, 134110
