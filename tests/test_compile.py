@@ -109,7 +109,8 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     whole |= launched(monkeypatch, precision, "implicit", CROWD)
     whole |= set().union(*(launched(monkeypatch, precision, stepper, WARM) for stepper in ("implicit", "euler")))
     whole |= launched(monkeypatch, precision, "implicit", {**WARM, "fluid.noise_tolerance": 1e-3})
-    whole |= launched(monkeypatch, precision, "implicit", {**WARM, **SWITCHES["body flow"]})
+    lawful = {"motor.law": "torque_speed"}
+    whole |= launched(monkeypatch, precision, "implicit", {**WARM, **SWITCHES["body flow"], **lawful})
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     free = {"body.enabled": False, "flagella.count": 1, "fluid.temperature": 300.0}
     reduced |= launched(monkeypatch, precision, "implicit", free)

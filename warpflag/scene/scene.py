@@ -204,10 +204,16 @@ class Scene(Section, key=""):
             if self.fluid.noise_tolerance is not None:
                 raise SceneError("fluid.noise_tolerance", self.fluid.noise_tolerance, f"needs {key} above 0", related)
             return
-        if self.motor.switching != "none" or any(spec.law != "constant" for spec in self.resolved_flagella()):
-            problem = "must be 0 with motors that switch or whose law is not constant"
-            raise SceneError(key, temperature, problem, ["motor.law", "motor.switching"])
         mode, numerics = self.hydrodynamics.mode, self.numerics
+        plain = self.motor.switching == "none" and all(spec.law == "constant" for spec in self.resolved_flagella())
+        if numerics.stepper == "euler" and not plain:
+            problem = f"must be implicit with {key} and motors that switch or whose law is not constant"
+            raise SceneError("numerics.stepper", "euler", problem, [key, "motor.law", "motor.switching"])
+        if self.polymorphs.enabled:
+            problem = (
+                f"must be false with {key}: forms change by moments without noise, which alone is 0.3 pN um a joint"
+            )
+            raise SceneError("polymorphs.enabled", True, problem, related)
         if mode in ("between", "as_printed"):
             problem = f"must be none, within, all or consistent with {key}: its mobility is not positive definite"
             raise SceneError("hydrodynamics.mode", mode, problem, related)

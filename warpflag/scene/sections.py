@@ -148,6 +148,9 @@ class Motor(Section, key="motor"):
         None, "Hz", 1e-3, 1e6, "rate in reverse at which the torque is zero", derived="motor.no_load"
     )
     rate: float = number(100.0, "Hz", -1e5, 1e5, "prescribed rate relative to the body; law rate")
+    averaging_time: float = number(
+        1e-3, "s", 1e-5, 10, "over which a motor averages the rate that its curve goes by, where there is thermal noise"
+    )
     switching: str = choice("none", ("none", "schedule", "markov"), "whether motors reverse during the run")
     switch_times: tuple[float, ...] = numbers((), "s", 0, 1e6, "when every motor reverses; with schedule")
     switch_ramp: float = number(1e-3, "s", 1e-6, 1, "time in which a motor goes from one sense to the other")

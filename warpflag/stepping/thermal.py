@@ -14,16 +14,18 @@ from warpflag_kernels.contact import contact_list, search
 from warpflag_kernels.fluid import body, body_noise, lanczos, node_velocity, noise
 from warpflag_kernels.implicit import (
     block_band,
+    collocation,
     contact_solve,
     delassus,
     krylov,
     linearised,
+    motor_solve,
     quasi_newton,
     stability,
     step_flow,
 )
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
-from warpflag_kernels.stepping import dense_output, health
+from warpflag_kernels.stepping import dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag_kernels.thermal import additive_chart, equilibrium, strain_gradients
@@ -70,6 +72,7 @@ class ThermalStepper:
     Attributes:
         noise: the struct `Noise`.
         lanczos: the process that draws the noise of the pair sum; None where there is none.
+        motors: the struct `MotorSolve`; None where torques are constant.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the start of the step; of an explicit stepper
             none.
     """
@@ -89,7 +92,9 @@ class ThermalStepper:
             self.lanczos = lanczos.allocate(model, [scene.fluid.noise_tolerance or 0.0 for scene in scenes])
         self._x, self._solved = chain_chart.allocate(model), None
         self._work = additive_chart.allocate(model)
-        self._smooth_terms = tuple(term for term in model.terms if not term.contact)
+        self._terms = tuple(term.within_step or term for term in model.terms)
+        self._smooth_terms = tuple(term for term in self._terms if not term.contact)
+        self.motors: Any = None
         self._touching = model.touching and not explicit
         self.stability: Any = None
         if explicit:
@@ -105,6 +110,11 @@ class ThermalStepper:
             self._magnitude = wp.zeros(len(contacts.gap), dtype=p.real, device=device)
             self._no_share = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
             linearised.allocate(model, system.state)
+            if model.switches.has("motor law"):
+                self.motors = motor_solve.allocate(model)
+                self.motors.time.assign([scene.motor.averaging_time for scene in scenes])
+                # There is no earlier step: its ratio to this one is zero.
+                self._data, self._none = collocation.allocate(model), chain_chart.allocate(model)
             if self._flows:
                 self._krylov = krylov.allocate(model)
                 self.stability = stability.allocate(model)
@@ -119,6 +129,8 @@ class ThermalStepper:
         s, parts, explicit = self._system, self._parts, self._explicit
         model, state = s.model, s.state
         equilibrium.begin_step(model, state, parts, explicit)
+        if model.timed:
+            evaluation_time.within_step(state, s.control, self._data.one, model.device)
         reconstruction.reconstruct(model, state, s.chart)
         noise.draw_local(model, state, s.control, self.noise)
         if explicit:
@@ -128,6 +140,8 @@ class ThermalStepper:
             self._evaluate()
             strain_gradients.stiffness_without_prestress(model, state, self.stiffness)
             linearised.factorise(model, state, self.stiffness, parts.band)
+            if self.motors is not None:
+                motor_solve.prepare(model, state, parts.band, self.motors)
         equilibrium.right_hand_side(model, state, parts, self.noise, self._x, explicit)
         x = self._x if explicit else self._solve()
         additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
@@ -189,7 +203,7 @@ class ThermalStepper:
         if self._touching:
             equilibrium.random_contacts(model, state, parts, self.noise, share, self._magnitude)
             contact_list.act(model, state, parts.contacts, self._magnitude)
-        body.body_motion(model, state)
+        body.body_motion(model, state, self._terms)
         node_velocity.node_velocities(model, state)
 
     def _solve(self) -> Any:
@@ -200,12 +214,24 @@ class ThermalStepper:
         if self._touching:
             found = self._solved
             contact_solve.solve(model, state, parts.contacts, parts.band, self.flow, self._x, parts.law, found)
+        if self.motors is not None:
+            self._solve_motors(found)
         if self._flows:
             krylov.solve(
                 model, state, self.stiffness, parts.band, parts.law.gain, self.stability, self._krylov,
                 self._product, found,
             )  # fmt: skip
+            if self.motors is not None:
+                self._solve_motors(found)
+        if self.motors is not None:
+            motor_solve.average_rates(model, state, parts.band, self.motors, found)
         return found
+
+    def _solve_motors(self, x: Any) -> None:
+        """Puts motors on their laws. The full mobility shifts their rates a little, so it is done before and after it
+        is solved with: what is left errs by the square of that share."""
+        model, state, parts, none = self._system.model, self._system.state, self._parts, self._none
+        motor_solve.solve(model, state, self._data, parts.band, parts.law.gain, self.motors, none, none, x)
 
     def restart(self) -> None:
         """A step knows nothing of those before it."""
@@ -214,8 +240,14 @@ class ThermalStepper:
         kept = {"evaluations": self._system.control.steps.numpy().copy()}
         if self.lanczos is not None:
             kept["noise_products"] = self.lanczos.data.total.numpy().copy()
+        if self.motors is not None:
+            kept["held_torque"] = self._system.state.data.motor.held.numpy().copy()
+            kept["average_rate"] = self.motors.average.numpy().copy()
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
         if self.lanczos is not None:
             self.lanczos.data.total.assign(memory["noise_products"])
+        if self.motors is not None:
+            self._system.state.data.motor.held.assign(memory["held_torque"])
+            self.motors.average.assign(memory["average_rate"])

@@ -11,6 +11,10 @@ every T_k is on its curve, in which it is linear piece by piece. A unit torque o
 one solution along all flagella at once, t; motors meet through the six unknowns of their body alone. Given its motion
 every motor settles by itself in closed form, and Newton's method finds the motion (`motor/laws.py` does the same at one
 moment, with the tripod's drag in place of the step's matrix).
+
+**With thermal noise** the rate of a step scatters by far more than a curve is wide, so a curve has no meaning for it. A
+motor then follows its curve by its rate averaged over a time tau, tau dA/dt = Omega - A, taken implicitly: with s =
+dt/(tau + dt) its curve sees s Omega + (1 - s) A. A prescribed rate is kept in every step, noise or not.
 """
 
 import functools
@@ -40,6 +44,9 @@ def struct(p: Precision) -> Any:
         free_rate: wp.array(dtype=real)  # Omega^0 [rad/s]
         change: wp.array(dtype=real)  # T - T^0 [pN um]
         moved: wp.array(dtype=vec6)  # [C], motion of the body that all changes cause
+        # Only with thermal noise.
+        time: wp.array(dtype=wp.float64)  # [C], tau [s]
+        average: wp.array(dtype=real)  # A [rad/s]
 
     return MotorSolve
 
@@ -54,11 +61,14 @@ def allocate(model: DeviceModel) -> Any:
         m.on_body, m.by_body = (wp.zeros(flagella, dtype=vec6, device=device) for _ in range(2))
         m.free_rate, m.change = (wp.zeros(flagella, dtype=p.real, device=device) for _ in range(2))
         m.moved = wp.zeros(model.cell_count, dtype=vec6, device=device)
+        if model.switches.noise:
+            m.time = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
+            m.average = wp.zeros(flagella, dtype=p.real, device=device)
     return m
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Implicit, MotorSolve = structs(p).Model, structs(p).State, collocation.struct(p), struct(p)
     Band, vec6 = block_band.types(p).Band, block_band.types(p).vec6
@@ -67,7 +77,26 @@ def _kernels(p: Precision) -> SimpleNamespace:
     body_rate, inverse6 = body_coupling.functions(p).body_rate, body_coupling.functions(p).inverse6
     follow = block_band.functions(p).follow
     most = wp.constant(laws.MOST_ITERATIONS)
-    module = p.module("motor_solve")
+    one, zero = wp.constant(real(1.0)), wp.constant(real(0.0))
+    module = p.module("motor_solve", "averaged" if averaged else "")
+
+    @wp.func(module=module)
+    def share_of(band: Band, motors: MotorSolve, c: wp.int32):
+        """Share s of a step's own rate in the average of cell c."""
+        return real(band.step[c] / (motors.time[c] + band.step[c]))
+
+    @wp.func(module=module)
+    def law_of(
+        model: Model, band: Band, motors: MotorSolve, k: wp.int32, c: wp.int32, drive: real, mobility: real, load: real
+    ):
+        """`settled` of motor k, by its average rate if the law asks for that."""
+        share = one
+        known = zero
+        if model.motor.prescribed[k] == 0:
+            share = share_of(band, motors, c)
+            known = (one - share) * motors.average[k]
+        torque, softness, slope = settled(model, k, drive, share * mobility, share * load + known)
+        return torque, share * softness, slope
 
     @wp.kernel(module=module)
     def load_tripods(
@@ -155,7 +184,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 mobility = per_step * motors.answer.node[model.first_node[k]][3]
                 free = motors.free_rate[k] + per_step * wp.dot(motors.by_body[k], moved)
                 load = free - mobility * state.motor.held[k]
-                torque, softness, slope = settled(model, k, drive_at(model, k, state.time[c]), mobility, load)
+                drive = drive_at(model, k, state.time[c])
+                if wp.static(averaged):
+                    torque, softness, slope = law_of(model, band, motors, k, c, drive, mobility, load)
+                else:
+                    torque, softness, slope = settled(model, k, drive, mobility, load)
                 if slope != state.motor.slope[k]:
                     changed = True
                 state.motor.slope[k] = slope
@@ -197,12 +230,40 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if e == model.first_node[model.first_flagellum[c]]:
             x.body[c] = x.body[c] + motors.moved[c]
 
-    return SimpleNamespace(load_tripods=load_tripods, couple=couple, find_torques=find_torques, add_changes=add_changes)
+    kernels = SimpleNamespace(
+        load_tripods=load_tripods, couple=couple, find_torques=find_torques, add_changes=add_changes
+    )
+    if averaged:
+
+        @wp.kernel(module=module)
+        def average(
+            # Model:
+            model: Model,
+            # State:
+            state: State,
+            band: Band,
+            x: Increment,
+            # Out:
+            motors: MotorSolve,
+        ):
+            k = wp.tid()
+            first = model.first_node[k]
+            c = model.cell_of[first]
+            if state.active[c] == 0:
+                return
+            b = x.body[c]
+            turned = x.node[first][3] - wp.dot(state.pose.tangent[first], vec3(b[3], b[4], b[5]))
+            share = share_of(band, motors, c)
+            rate = turned / real(band.step[c])
+            motors.average[k] = share * rate + (one - share) * motors.average[k]
+
+        kernels.average = average
+    return kernels
 
 
 def prepare(model: DeviceModel, state: DeviceState, band: Any, motors: Any) -> None:
     """What unit torques do to a step, from the factors of its matrix."""
-    kernels, device = _kernels(model.precision), model.device
+    kernels, device = _kernels(model.precision, model.switches.noise), model.device
     inputs = [model.data, state.data, motors]
     wp.launch(kernels.load_tripods, model.element_count, inputs=inputs, device=device)
     block_band.solve(model, state, band, motors.answer)
@@ -220,8 +281,14 @@ def solve(
         last, found: the last increment, and what has been found of this one, both at the present pose.
         x: what an iteration has found with the torques as they were; changed.
     """
-    kernels, device = _kernels(model.precision), model.device
+    kernels, device = _kernels(model.precision, model.switches.noise), model.device
     inputs = [model.data, data, band, gain, last, found, x, state.data, motors]
     wp.launch(kernels.find_torques, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band, gain, motors, x]
     wp.launch(kernels.add_changes, model.element_count, inputs=inputs, device=device)
+
+
+def average_rates(model: DeviceModel, state: DeviceState, band: Any, motors: Any, x: Any) -> None:
+    """The average rates after a step, whose whole increment is x; only with thermal noise."""
+    kernel, inputs = _kernels(model.precision, True).average, [model.data, state.data, band, x, motors]
+    wp.launch(kernel, model.flagellum_count, inputs=inputs, device=model.device)
