@@ -1,0 +1,100 @@
+"""Energies of joints, their bias in the step, lengths of segments, persistence."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from . import exact
+from .ensembles import FREE, KT, STRAIGHT, ensemble, looks, mean, shown
+
+SHORT = {"flagella.length": 1.2}
+TWO = {"flagella.count": 2}
+# Side by side along their whole length, 0.05 um from each other.
+BUNDLED = {
+    **TWO,
+    "flagella.opening_angle": 0.0,
+    "flagellum.0.azimuth": 0.0,
+    "flagellum.1.azimuth": 2 * math.degrees(math.asin(0.05 / 0.8)),
+    "flagella.phase_difference": 0.0,
+}
+FLOW = {"hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": True, "hydrodynamics.body_beads": 60}
+HOOKED = {"hook.length": 0.055, "hook.stiffness": 0.65}
+# Cell, values, step, cells, start, interval of the looks [s], number of looks.
+CASES: list[tuple[str, dict[str, Any], float, int, float, float, int]] = [
+    ("free, 1.2 µm", {**FREE, **SHORT}, 1e-6, 100, 1e-3, 4e-6, 400),
+    ("two on a body, 1.2 µm", {**TWO, **SHORT}, 1e-6, 100, 5e-4, 4e-6, 300),
+    ("two on a body, 1.2 µm", {**TWO, **SHORT}, 1e-5, 100, 5e-4, 2e-5, 300),
+    ("the same, float32", {**TWO, **SHORT, "numerics.precision": "float32"}, 1e-5, 100, 5e-4, 2e-5, 300),
+    ("the same, 0.05 µm apart", {**BUNDLED, **SHORT}, 1e-5, 100, 5e-4, 2e-5, 300),
+    ("the same, hooks and flow round the body", {**BUNDLED, **SHORT, **FLOW, **HOOKED}, 1e-5, 100, 5e-4, 2e-5, 200),
+    ("two on a body, 6 µm", TWO, 1e-5, 24, 2e-2, 2e-4, 100),
+    ("the same, 0.05 µm apart", BUNDLED, 1e-5, 24, 2e-2, 2e-4, 100),
+    ("the same, 0.05 µm apart", BUNDLED, 1e-6, 24, 5e-3, 5e-5, 60),
+]
+
+
+def _row(
+    name: str, values: dict[str, Any], step: float, count: int, start: float, interval: float, frames: int
+) -> None:
+    scene, sim = ensemble({**values, "numerics.time_step": step}, count)
+    found = [c.elastic_energy / KT for c in looks(sim, start, interval, frames)]
+    value, error = mean(np.mean(found, axis=0) / exact.energies(scene))
+    print(f"| {name} | {step:g} | " + " | ".join(map(shown, value, error)) + " |", flush=True)
+
+
+def energies(share: float) -> None:
+    """Energy per joint over its exact value."""
+    print("\n| cell | step [s] | bend | twist | stretch |\n|---|---|---|---|---|")
+    for name, values, step, count, start, interval, frames in CASES:
+        _row(name, values, step, count, start, interval, max(10, int(share * frames)))
+
+
+def order(share: float) -> None:
+    """The bias of the energies of a free filament in the step."""
+    print("\n| cell | step [s] | bend | twist | stretch |\n|---|---|---|---|---|")
+    for step in (5e-6, 1e-5, 2e-5, 4e-5):
+        _row("free, 1.2 µm", {**FREE, **SHORT}, step, 100, 1e-3, 2 * step, max(40, int(share * 4000)))
+
+
+def lengths(share: float) -> None:
+    """Mean strain of a segment, which tells whether kT div M is there: weight l^2 exp(-U/kT)."""
+    stiffness, h = 300.0, 0.2
+    values = {**FREE, "flagella.length": 0.4, "flagella.stretching_stiffness": stiffness, "numerics.time_step": 2e-7}
+    _, sim = ensemble(values, 200)
+    strains = []
+    for cells in looks(sim, 4e-5, 1e-6, max(50, int(share * 2000))):
+        x = cells.positions.reshape(200, 3, 3)
+        strains.append((np.linalg.norm(np.diff(x, axis=1), axis=2) / h - 1).mean(axis=1))
+    l = np.linspace(0.9, 1.1, 200_001)
+
+    def weighted(power: float) -> float:
+        weight = l**power * np.exp(-stiffness * h * (l - 1) ** 2 / (2 * KT))
+        return float(np.sum(weight * (l - 1)) / np.sum(weight))
+
+    value, error = mean(np.mean(strains, axis=0))
+    print(
+        f"\nmean strain, K = {stiffness:g} pN: {shown(1e4 * value, 1e4 * error)}e-4, exact {1e4 * weighted(2.0):.3f}"
+        f"e-4; a dumbbell without the drift term {1e4 * weighted(2 * 1.6 / 2.8):.3f}e-4",
+        flush=True,
+    )
+
+
+def persistence(share: float) -> None:
+    """<t.t'> of neighbouring segments, and the persistence length of a straight filament."""
+    print("\n| filament, 1.2 µm | exact | simulated |\n|---|---|---|")
+    frames = max(50, int(share * 1000))
+    for name, values, known in (("straight, free", STRAIGHT, 0.9997634), ("helix, free", {}, 0.965061)):
+        _, sim = ensemble({**FREE, **SHORT, **values, "numerics.time_step": 1e-5}, 100)
+        cosines = []
+        for cells in looks(sim, 1e-3, 2e-5, frames):
+            t = np.diff(cells.positions.reshape(100, -1, 3), axis=1)
+            t /= np.linalg.norm(t, axis=2, keepdims=True)
+            cosines.append(np.sum(t[:, 1:] * t[:, :-1], axis=2).mean(axis=1))
+        value, error = mean(np.mean(cosines, axis=0))
+        print(f"| 1 - <t.t'>, {name} | {1 - known:.4g} | {shown(1 - value, error)} |", flush=True)
+        if name.startswith("straight"):
+            length, scatter = -0.2 / math.log(value), 0.2 * error / (1 - value) ** 2
+            print(f"| persistence length [µm] | 845 | {shown(length, scatter)} |", flush=True)
