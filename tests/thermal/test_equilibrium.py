@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import cell, touching_cell
+from warpflag.run.faults import NumericalError
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, SceneError, with_values
 
@@ -150,6 +151,20 @@ def test_frames_are_ends_of_steps(stepper, device):
     assert [frame.step for frame in frames] == [0, 3, 6]
     assert np.allclose(frames[-1].positions, sim.state.positions, rtol=0, atol=1e-12)
     assert not np.allclose(frames[-1].positions, frames[1].positions, rtol=0, atol=1e-12)
+
+
+def test_no_step_is_rejected(device):
+    """Every cell takes the same steps whatever its noise, cut only where a time is asked for; a step that is not sound
+    stops its cell. So there is no step whose noise would have to be divided."""
+    values = {**PASSIVE, "flagella.length": 0.6, "hydrodynamics.mode": "all", "numerics.time_step": 1e-5}
+    scenes = [cell({**values, "fluid.seed": i, "fluid.temperature": 300.0 * 1.5**i}) for i in range(5)]
+    wild = cell({**values, "motor.torque": 100.0})
+    sim = Simulation([*scenes, wild], device=device)
+    with pytest.raises(NumericalError, match="stopped at 0 ms"):
+        sim.advance(1.05e-4)
+    sim.exclude(5)
+    assert sim.steps.tolist() == [11] * 5 + [0]
+    assert np.all(sim.times[:5] == 1.05e-4) and sim.times[5] == 0.0
 
 
 def test_steppers_take_the_same_noise(device):
