@@ -9,11 +9,17 @@ Dense mobilities are put together from the coefficients that a run uses (`warpfl
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
-from tools import cells, helices
+
+sys.path.insert(0, str(Path(__file__).parent / "tools"))
+import cells
+import helices
+import joint
 
 ETA = 1e-3
 BEADS = (30, 60, 120, 480)
@@ -114,6 +120,30 @@ def eigenvalues(states: int) -> str:
     )
 
 
+def coaxial() -> str:
+    """One polar flagellum on a hook: linear stability of the same nodes as a rigid body beside runs, and speeds."""
+    rows = []
+    for length, torque, flow in itertools.product((6.0, 8.0), (0.38, 1.0), (True, False)):
+        shares = np.array([1e-3, 0.35, 0.65])
+        scenes = [joint.polar_cell(torque, share * torque, flow, length) for share in shares]
+        exact = np.array([joint.stability(scene).growth for scene in scenes])
+        stiff = joint.polar_cell(torque, 100.0, flow, length)
+        speed, motor = joint.rigid_speed(stiff)
+        found = joint.growth_rates(scenes, 2.2 / motor)
+        swum = joint.speed_of_run(stiff, motor)[0]
+        thresholds = [float(np.interp(0.0, -growth[1:], shares[1:])) for growth in (exact, found)]
+        rows.append([
+            f"{length:g}", f"{torque:g}", "yes" if flow else "no", f"{exact[0]:.1f}", f"{found[0]:.1f}",
+            *(f"{x:.3f}" for x in thresholds), f"{speed:.2f}", f"{swum:.2f}",
+        ])  # fmt: skip
+    head = ["length", "torque", "body flow", "growth 1/s", "of runs", "threshold / torque", "of runs"]
+    return table(
+        "A polar flagellum: growth with a free joint, hook stiffness that makes it stable, speed with a stiff hook",
+        [*head, "rigid um/s", "of runs"],
+        rows,
+    )
+
+
 def plot(path: Path) -> None:
     """Radial mobility beside the body, and the far field of a swimmer."""
     from matplotlib.figure import Figure
@@ -140,7 +170,7 @@ def main() -> None:
     parser.add_argument("--states", type=int, default=1000, help="poses per mode whose eigenvalues are found")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    text = "\n".join([johnson(), rodenborn(), rods(), shell(), eigenvalues(options.states)])
+    text = "\n".join([johnson(), rodenborn(), rods(), shell(), coaxial(), eigenvalues(options.states)])
     (options.output / "tables.md").write_text(text, encoding="utf-8")
     print(text)
     plot(options.output / "hydrodynamics.png")
