@@ -16,9 +16,10 @@ from warpflag_kernels.implicit import linearised
 from warpflag_kernels.rod import chain_chart
 
 from tests.helpers import anchors, cell, matrix, shaken
-from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius
+from tests.oracles import dense_mobility, drag_coefficients, expected_pair_radius, whole_mobility
 from tests.plans import plan
 from warpflag.model.geometry import InitialState
+from warpflag.model.shell import body_shell
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
 from warpflag.scene.resistance import spheroid_mobility
@@ -97,8 +98,10 @@ class Bench:
         return np.stack(columns, axis=1)
 
     def mobility(self, mode: str | None = None) -> np.ndarray:
-        """Dense M of (body, nodes); the displacement of r_0 has none. mode: other hydrodynamics than the scene's."""
-        scene = self.scene if mode is None else with_values(self.scene, {"hydrodynamics.mode": mode})
+        """Dense M of (body, nodes); the displacement of r_0 has none. mode: other hydrodynamics than the scene's, without
+        flow round the body, but the body's own mobility is that of its shell if the scene has one."""
+        other = {"hydrodynamics.mode": mode, "hydrodynamics.body_flow": False}
+        scene = self.scene if mode is None else with_values(self.scene, other)
         size = 6 + 4 * self.count
         mobility = np.zeros((size, size))
         free = np.setdiff1d(np.arange(self.count), self.first)
@@ -113,6 +116,11 @@ class Bench:
             turn = b.spin * body.axial_rotation
             for i, along, across in ((0, b.along, b.across), (3, turn, b.tumble)):
                 mobility[i : i + 3, i : i + 3] = across * np.eye(3) + (along - across) * np.outer(axis, axis)
+        if self.scene.hydrodynamics.body_flow:
+            shell = body_shell(body.length, body.width, scene.hydrodynamics.body_beads)
+            whole = whole_mobility(self.scene, self.start, shell.points, shell.radius)
+            coupled = np.concatenate([np.arange(6), where]) if mode is None else np.arange(6)
+            mobility[np.ix_(coupled, coupled)] = whole[: len(coupled), : len(coupled)]
         return mobility
 
     def local_inverse(self) -> np.ndarray:

@@ -209,9 +209,10 @@ def test_a_coaxial_flagellum_swims_slower_in_the_wake_of_its_body(device):
         assert found == (pytest.approx(speed, abs=0.2), pytest.approx(body, abs=0.1), pytest.approx(motor, abs=1.0))
 
 
-def test_second_order_and_the_same_solution_as_the_explicit_stepper(device):
+@pytest.mark.parametrize("hook", [{}, {"hook.length": 0.055, "hook.stiffness": 0.65}], ids=["", "hook"])
+def test_second_order_and_the_same_solution_as_the_explicit_stepper(hook, device):
     """In contact with the body and each other, 0.2 ms after the motors start."""
-    scene = touching_cell({**ON, "numerics.stepper": "implicit", "motor.torque": 1.0})
+    scene = touching_cell({**ON, **hook, "numerics.stepper": "implicit", "motor.torque": 1.0})
     begun = Simulation(scene, device=device)
     begun.advance(2e-4)
     assert begun.state.steric_force > 0.1

@@ -17,7 +17,13 @@ STEP, GAIN, WEIGHT = 1e-5, 2 / 3, 1.3
 STIFF = {"flagella.bending_rigidity": 35.0, "flagella.twist_rigidity": 35.0, "flagella.stretching_stiffness": 1e4}
 
 
-@pytest.mark.parametrize("values", [{}, {"body.anchored": True}, {"flagella.count": 1}, {"flagella.count": 3}])
+HOOK = {"hook.length": 0.055, "hook.stiffness": 2.0}
+FLOW = {"hydrodynamics.body_flow": True, "hydrodynamics.body_beads": 30}
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"body.anchored": True}, {"flagella.count": 1}, {"flagella.count": 3}, {**HOOK, **FLOW}]
+)
 def test_the_solution_is_that_with_the_full_mobility(values, device, precision):
     """From P b, and only in cells that are strongly coupled."""
     scene = {**STIFF, "steric.enabled": False, "body.contact": False, **values}
@@ -55,6 +61,7 @@ FAMILY = {
     "free, stiffer": ({}, 1e4),
     "stretch alone": ({"flagella.stretching_stiffness": 1e7}, 1.0),
     "three": ({"flagella.count": 3, "flagella.opening_angle": 90.0}, 100.0),
+    "hook and body flow": ({**HOOK, **FLOW}, 100.0),
 }
 
 

@@ -17,8 +17,10 @@ from tests.oracles import (
     energy,
     expected_pair_radius,
     slope,
+    whole_mobility,
 )
 from warpflag.model.geometry import InitialState
+from warpflag.model.shell import body_shell
 from warpflag.run.simulation import Evaluation, Simulation
 from warpflag.scene import Scene, with_values
 from warpflag.scene.resistance import spheroid_mobility
@@ -37,7 +39,8 @@ UNEQUAL = {
 
 
 HOOK = {"hook.length": 0.055, "hook.stiffness": 2.0, "hook.stiffening_torque": 3.0}
-CASES = {"two": {}, "unequal": UNEQUAL, "hook": HOOK}
+FLOW = {"hydrodynamics.body_flow": True, "hydrodynamics.body_beads": 30}
+CASES = {"two": {}, "unequal": UNEQUAL, "hook": HOOK, "hook and body flow": {**HOOK, **FLOW}}
 
 
 @cache
@@ -83,18 +86,24 @@ def imbalance(scene: Scene, start: InitialState, found: Evaluation) -> float:
     """(Motor power - dissipation - dE/dt) over the dissipation, from the velocities alone.
 
     dE/dt: central difference of the elastic and steric energy along the velocity. Dissipation: v.M^-1.v with a dense
-    mobility. Motor power: T_m on each tripod's spin, -T_m m on the body's.
+    mobility, that of the body and nodes together with flow round it. Motor power: T_m on each tripod's spin, -T_m m on
+    the body's.
     """
     nodes, first = free_nodes(scene), anchors(scene)
     v, h = found.velocities[nodes].ravel(), np.array([spec.segment_length for spec in scene.resolved_flagella()])
-    mobility = dense_mobility(scene, start, expected_pair_radius(scene))
     counts = [len(x) for x in start.positions]
     spin_drag = drag_coefficients(scene)[2] * np.repeat(h, counts)
-    along, across, spin, tumble = body_drags(scene)
-    axis = matrix(start.body_orientation)[:, 2]
-    dissipation = v @ np.linalg.solve(mobility, v) + spin_drag @ found.spins**2
-    for motion, parallel, other in ((found.body_velocity, along, across), (found.body_spin, spin, tumble)):
-        dissipation += other * motion @ motion + (parallel - other) * (motion @ axis) ** 2
+    dissipation = spin_drag @ found.spins**2
+    if scene.hydrodynamics.body_flow:
+        shell = body_shell(scene.body.length, scene.body.width, scene.hydrodynamics.body_beads)
+        motions = np.concatenate([found.body_velocity, found.body_spin, v])
+        dissipation += motions @ np.linalg.solve(whole_mobility(scene, start, shell.points, shell.radius), motions)
+    else:
+        dissipation += v @ np.linalg.solve(dense_mobility(scene, start, expected_pair_radius(scene)), v)
+        along, across, spin, tumble = body_drags(scene)
+        axis = matrix(start.body_orientation)[:, 2]
+        for motion, parallel, other in ((found.body_velocity, along, across), (found.body_spin, spin, tumble)):
+            dissipation += other * motion @ motion + (parallel - other) * (motion @ axis) ** 2
 
     motor = np.array([spec.torque for spec in scene.resolved_flagella()])
     m = np.array([t[0] for t in tangents(scene, start)])
