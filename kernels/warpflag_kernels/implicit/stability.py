@@ -81,13 +81,15 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
+    """The kernels; those of cells with flow round their bodies, or without."""
     real = p.real
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
-    module = p.module("stability")
+    module = p.module("stability", "body_flow" if body_flow else "")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
     long_interval, first_of_flexible = wp.constant(LONG_INTERVAL), wp.constant(FIRST_OF_FLEXIBLE)
     large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
+    large_kappa_of_stiff = wp.constant(wp.float64(0.0 if body_flow else LARGE_KAPPA))
     half_turn, tight = wp.constant(real(math.pi)), wp.constant(wp.float64(TIGHT))
     free_rod, relaxed = wp.constant(real(FREE_ROD**2)), wp.constant(wp.float64(RELAXED))
     least, most, share, fall = (
@@ -224,7 +226,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             # Of cells measured rarely the first product only turns the probe: of a vector of any direction it tells
             # nothing. The others are solved in full until their probe has turned.
             if stability.kappa[c] > wp.float64(0.0) or not weak:
-                stability.strong[c] = wp.where(kappa > wp.where(flexible, large_kappa_of_flexible, large_kappa), 1, 0)
+                most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
+                stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
                 if stability.strong[c] != 0:
                     stability.any_strong[0] = 1
                 if flexible and stability.strong[c] == 0:
@@ -258,7 +261,8 @@ def schedule(
         stability: struct `Stability`.
     """
     inputs = [model.data, state.data, steps, accepted, longest_step, stability]
-    wp.launch(_kernels(model.precision).schedule, model.cell_count, inputs=inputs, device=model.device)
+    kernel = _kernels(model.precision, model.switches.flows.body).schedule
+    wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
 
 
 def measure(
@@ -280,7 +284,7 @@ def measure(
         over_implicit: shape [cell_count].
         longest_step: as in `schedule`.
     """
-    kernels, device = _kernels(model.precision), model.device
+    kernels, device = _kernels(model.precision, model.switches.flows.body), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
     linearised.solve(model, state, band, response)
