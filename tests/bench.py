@@ -98,8 +98,11 @@ class Bench:
         return np.stack(columns, axis=1)
 
     def mobility(self, mode: str | None = None) -> np.ndarray:
-        """Dense M of (body, nodes); the displacement of r_0 has none. mode: other hydrodynamics than the scene's, without
-        flow round the body, but the body's own mobility is that of its shell if the scene has one."""
+        """Dense M of (body, nodes); the displacement of r_0 has none.
+
+        mode: other hydrodynamics than the scene's, without flow round the body; the body's own mobility stays that of
+        its shell if the scene has one.
+        """
         other = {"hydrodynamics.mode": mode, "hydrodynamics.body_flow": False}
         scene = self.scene if mode is None else with_values(self.scene, other)
         size = 6 + 4 * self.count
