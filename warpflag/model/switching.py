@@ -7,14 +7,17 @@ alone: the same on every device, in a batch of any size, whatever steps are take
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 from collections.abc import Iterable
 
 import numpy as np
 
 from warpflag.scene import Scene
 
-__all__ = ["corners", "switch_times"]
+__all__ = ["corners", "second_intervals", "switch_times"]
 
+_SECOND_STREAMS = 1 << 40  # random numbers of motor k for its second form are those of the stream this many beyond
 _BEYOND = 2.0  # switches are drawn this many times beyond the scene's end, for a run that is advanced further
 
 
@@ -51,6 +54,26 @@ def switch_times(scene: Scene, motor: int) -> tuple[float, ...]:
         return scene.resolved_flagella()[motor].switch_times
     m = scene.motor
     return _markov(m.seed, motor, m.to_reverse, m.to_forward, m.coupling, _BEYOND * scene.duration)
+
+
+def second_intervals(scene: Scene, motor: int) -> tuple[tuple[float, float], ...]:
+    """When joints of a flagellum go on to its second form: beginnings and ends [s].
+
+    In every interval in which the motor winds the filament up against its handedness, from an exponential delay on.
+    """
+    forms = scene.polymorphs
+    if forms.second == "none" or forms.second_rate <= 0.0:
+        return ()
+    winds_up = scene.resolved_flagella()[motor].torque * scene.flagella.ground_strain[2] > 0.0
+    ends = [0.0, *switch_times(scene, motor), math.inf]
+    delays = _ticks(scene.motor.seed, _SECOND_STREAMS + motor, forms.second_rate, 0, math.inf)
+    found, last = [], 0.0
+    for begin, end in itertools.islice(itertools.pairwise(ends), 0 if winds_up else 1, None, 2):
+        tick = next(iter(delays))[0]
+        begin, last = begin + tick - last, tick
+        if begin < end:
+            found.append((begin, end))
+    return tuple(found)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base.plan import Flows, Switches
 
-from warpflag.model.switching import corners
+from warpflag.model.switching import corners, second_intervals
 from warpflag.record.cell_state import Evaluation
 from warpflag.scene import Scene
 from warpflag.scene.helix import rest_shape
@@ -87,7 +87,7 @@ def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: 
 def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
     flagella = [(scene, spec) for scene in scenes for spec in scene.resolved_flagella()]
     rest = [
-        rest_shape(scene.flagella.intrinsic_curvature, s.segment_length, s.segment_count, scene.flagella.on_axis)
+        rest_shape(scene.flagella.ground_strain, s.segment_length, s.segment_count, scene.flagella.on_axis)
         for scene, s in flagella
     ]
     limits = [scene.hook.stiffening_torque for scene, _ in flagella]
@@ -102,18 +102,26 @@ def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) 
 def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
     own = data.rod.rest_strain.numpy().astype(np.float64)
     first = data.first_node.numpy()
-    both, specs = np.repeat(own, 2, axis=0), [(s, spec) for s in scenes for spec in s.resolved_flagella()]
-    for k, (scene, spec) in enumerate(specs):
-        target = spec.segment_length * np.array(getattr(scene.polymorphs, scene.polymorphs.target))
-        if scene.flagella.intrinsic_curvature[2] > 0.0:  # a right-handed filament has the mirror images of all forms
-            target *= (-1.0, 1.0, -1.0)
-        both[2 * first[k] + 1 : 2 * first[k + 1] : 2] = target
-    forms = [scene.polymorphs for scene, _ in specs]
+    strains = np.repeat(own, 3, axis=0)
+    specs = [(scene, k, spec) for scene in scenes for k, spec in enumerate(scene.resolved_flagella())]
+    for k, (scene, _, spec) in enumerate(specs):
+        for form, name in enumerate((scene.polymorphs.target, scene.polymorphs.second), 1):
+            if name == "none":
+                continue
+            strain = spec.segment_length * np.array(getattr(scene.polymorphs, name))
+            if scene.flagella.ground_strain[2] > 0.0:  # a right-handed filament has the mirror images of all forms
+                strain *= (-1.0, 1.0, -1.0)
+            strains[3 * first[k] + form : 3 * first[k + 1] : 3] = strain
+    forms = [scene.polymorphs for scene, _, _ in specs]
     m, pairs = data.polymorphs, functools.partial(wp.array, dtype=wp.vec2d, device=device)
-    m.rest_strain = wp.array(both, dtype=precision.vec3, device=device)
+    m.rest_strain = wp.array(strains, dtype=precision.vec3, device=device)
     m.ramp = wp.array([f.ramp for f in forms], dtype=wp.float64, device=device)
     m.nucleation = pairs(np.array([(f.nucleation, -f.nucleation_back) for f in forms]))
     m.propagation = pairs(np.array([(f.propagation, f.propagation_back) for f in forms]))
+    tables = [second_intervals(scene, k) for scene, k, _ in specs]
+    first_interval = np.concatenate([[0], np.cumsum([len(own) for own in tables])])
+    m.first_second = wp.array(first_interval, dtype=wp.int32, device=device)
+    m.second = pairs(np.concatenate([np.reshape(own, (-1, 2)) for own in tables]))
 
 
 def _external_forces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -153,6 +161,11 @@ SCENE_TERMS = (
     SceneTerm("elastic", lambda scene: True),
     SceneTerm("bearing", lambda scene: scene.motor.bearing_torque and scene.body.enabled),
     SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),
+    SceneTerm(
+        "hook that stiffens",
+        lambda scene: bool(scene.hook.stiffening_torque and scene.hook.stiffness and scene.body.enabled)
+        and not _plain(scene),
+    ),
     SceneTerm("steric", lambda scene: scene.steric.enabled and not scene.steric.self_contact and _several(scene)),
     SceneTerm("steric with self", lambda scene: scene.steric.enabled and scene.steric.self_contact),
     SceneTerm("body contact", lambda scene: scene.body.contact and scene.body.enabled),

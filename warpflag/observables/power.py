@@ -20,7 +20,7 @@ class PowerBalance:
 
     Attributes:
         supplied: by the name of the force term: "motor" or, where the torque is not constant, "motor law", T_m on each
-            tripod and -T_m m on the body; "external".
+            tripod and -T_m m on the body; "external"; "polymorphs", what ground states that change put in.
         translation: dissipated by the moving nodes, the flow between them included.
         spin: dissipated by the segments' spin about their tangents.
         body: dissipated by the body's translation and rotation.

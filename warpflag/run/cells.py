@@ -15,6 +15,7 @@ from warpflag_kernels.rod import elastic
 from warpflag.model.terms import supplied_power
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.scene import Scene
+from warpflag.scene.helix import joint_strain
 from warpflag.stepping import System
 
 __all__ = ["Cells", "CellsReader", "evaluation_of", "motor_torques"]
@@ -163,7 +164,40 @@ def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -
         body_velocity=host(state.body_velocity, cell),
         body_spin=host(state.body_spin, cell),
     )
-    return dataclasses.replace(found, supplied=supplied_power(scene, found))
+    supplied = supplied_power(scene, found)
+    if model.switches.has("polymorphs"):
+        supplied["polymorphs"] = _ramp_power(system, flagella, nodes)
+    return dataclasses.replace(found, supplied=supplied)
+
+
+def _ramp_power(system: System, flagella: slice, nodes: slice) -> float:
+    """Rate at which ground states that change put energy into one cell at a pose that stands still [pN um/s]."""
+    model, state = system.model.data, system.state.data
+    forms, own = state.forms, np.arange(nodes.start, nodes.stop)
+    form, before = forms.form.numpy()[own], forms.before.numpy()[own]
+    rests = model.polymorphs.rest_strain.numpy().reshape(-1, 3, 3).astype(np.float64)[own]
+    of = model.flagellum_of.numpy()[own]
+    ramp = model.polymorphs.ramp.numpy()[of]
+    share = (state.time.numpy()[model.cell_of.numpy()[nodes.start]] - forms.changed.numpy()[own]) / ramp
+    pace = np.where((share >= 0.0) & (share < 1.0), 6.0 * share * (1.0 - share), 0.0) / ramp
+    rows = np.arange(len(own))
+    rate = pace[:, None] * (rests[rows, form] - rests[rows, before])
+    power = 0.0
+    first = model.first_node.numpy()
+    for k in range(flagella.start, flagella.stop):
+        here = slice(first[k] + 1, first[k + 1])  # segments 1 to N, with N - 1 joints
+        tangents, directors, rest = (
+            array.numpy()[here].astype(np.float64)
+            for array in (state.pose.tangent, state.pose.director, forms.rest_strain)
+        )
+        a, c, h = (
+            float(array.numpy()[k])
+            for array in (model.rod.bending_rigidity, model.rod.twist_rigidity, model.rod.segment_length)
+        )
+        moment = np.array([a, a, c]) / h * (joint_strain(tangents, directors) - rest[:-1])
+        local = slice(here.start - nodes.start, here.stop - 1 - nodes.start)
+        power -= float((moment * rate[local]).sum())
+    return power
 
 
 def motor_torques(system: System) -> np.ndarray:

@@ -279,7 +279,7 @@ class Run:
             "accuracy": accuracy_kept(scene, copied),
             "growth": None,
             "balance": {
-                "judged": getattr(simulation.stepper, "balanced", False),
+                "judged": "stepper.balance_refused" in copied,
                 "violations": copied["stepper.balance_refused"][0] if "stepper.balance_refused" in copied else 0,
             },
             "batch": len(self.members),

@@ -343,7 +343,9 @@ class Simulation:
             carried["guard.position"] = self.system.guard.position
         if self.system.model.switches.has("polymorphs"):
             forms = self.system.state.data.forms
-            carried |= {"forms.form": forms.form, "forms.changed": forms.changed}
+            carried |= {f"forms.{name}": getattr(forms, name) for name in ("form", "before", "changed")}
+        if self.system.model.switches.has("hook that stiffens"):
+            carried["motor.on_hook"] = self.system.state.data.motor.on_hook
         return carried
 
     @alone

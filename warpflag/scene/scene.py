@@ -114,6 +114,7 @@ class Scene(Section, key=""):
             self._check_flows,
             self._check_start,
             self._check_hook,
+            self._check_helix,
             self._check_noise,
         ):
             with problems.gathered():
@@ -196,6 +197,17 @@ class Scene(Section, key=""):
         if self.hook.stiffening_torque is not None and not self.hook.stiffness:
             problem = "must be absent where hook.stiffness = 0"
             raise SceneError("hook.stiffening_torque", self.hook.stiffening_torque, problem, ["hook.stiffness"])
+
+    def _check_helix(self) -> None:
+        """Either strains, or radius and pitch."""
+        group = self.flagella
+        given = {"helix_radius": group.helix_radius, "helix_pitch": group.helix_pitch}
+        for (key, value), (other, missing) in zip(given.items(), reversed(given.items()), strict=True):
+            if value is not None and missing is None:
+                raise SceneError(f"flagella.{key}", value, f"needs flagella.{other}", [f"flagella.{other}"])
+        if group.helix_radius is not None and group.intrinsic_curvature != Flagella().intrinsic_curvature:
+            problem = "must be absent where flagella.helix_radius and helix_pitch are given"
+            raise SceneError("flagella.intrinsic_curvature", group.intrinsic_curvature, problem)
 
     def _check_noise(self) -> None:
         """What thermal noise does not go with."""
@@ -287,7 +299,7 @@ class Scene(Section, key=""):
         if not 2 <= spec.segment_count <= 10_000:
             problem = f"makes {spec.segment_count} of {spec.length:g} um; 2 to 10000 segments are allowed"
             raise SceneError(key, value, problem, lengths)
-        twist = spec.segment_length * abs(self.flagella.intrinsic_curvature[2])
+        twist = spec.segment_length * abs(self.flagella.ground_strain[2])
         if twist >= math.pi:
             problem = (
                 f"makes segments of {spec.segment_length:g} um; with flagella.intrinsic_curvature the frame "

@@ -10,9 +10,13 @@ Body axes: e_b3 is the long axis and points to the rear, e_b1 is where azimuths 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, text, vector
+
+FORMS = ("semicoiled", "curly_1", "coiled")
+"""Forms of a filament that have names, beside that of its ground state."""
 
 MOTOR_LAWS = ("constant", "torque_speed", "rate")
 
@@ -66,6 +70,12 @@ class Flagella(Section, key="flagella"):
         100,
         "strain Omega^0 of the ground state about e1, e2, e3, the paper's; third positive: right-handed",
     )
+    helix_radius: float | None = number(
+        None, "um", 1e-6, 100, "of the ground state, with helix_pitch", derived="as intrinsic_curvature says"
+    )
+    helix_pitch: float | None = number(
+        None, "um", -1e3, 1e3, "of the ground state; negative: left-handed", derived="as intrinsic_curvature says"
+    )
     filament_radius: float = number(
         0.010, "um", 1e-3, 0.5, "a, not printed but implied by the paper's gamma_R = 4 pi eta a^2"
     )
@@ -75,6 +85,18 @@ class Flagella(Section, key="flagella"):
     hook_twist_factor: float = number(
         3.0, "", 1e-3, 1e3, "twist rigidity of the hook joint over C, the paper's; it bends freely"
     )
+
+    @property
+    def ground_strain(self) -> tuple[float, float, float]:
+        """Strain Omega^0 of the ground state [1/um]: intrinsic_curvature, or that of the helix of radius and pitch.
+
+        A smooth helix of radius R and pitch P has curvature R/w and torsion p/w, w = R^2 + p^2, p = P/(2 pi).
+        """
+        if self.helix_radius is None or self.helix_pitch is None:
+            return self.intrinsic_curvature
+        p = self.helix_pitch / (2.0 * math.pi)
+        w = self.helix_radius**2 + p * p
+        return (0.0, self.helix_radius / w, p / w)
 
 
 @dataclass(frozen=True)
@@ -187,6 +209,7 @@ class Hook(Section, key="hook"):
 class Polymorphs(Section, key="polymorphs"):
     """Forms that the filament changes to under its own moment, joint by joint: those of a bacterial flagellum.
 
+    Rate of going on to the second form: Mears et al., eLife 3, e01916 (2014), for curly-1, as used in models built on it.
     Moments are about the helix axis, against the handedness of the ground state, as a reversed motor winds it up.
     Thresholds of nucleation: Hotani, J. Mol. Biol. 156, 791 (1982). Those of propagation lie on both sides of the
     middle of these two, which is a choice. Strains of the target: from pitch and radius, semicoiled and curly-1 with
@@ -194,7 +217,11 @@ class Polymorphs(Section, key="polymorphs"):
     """
 
     enabled: bool = switch(False, "joints flip between the ground state and the target")
-    target: str = choice("semicoiled", ("semicoiled", "curly_1", "coiled"), "form that reversed motors lead to")
+    target: str = choice("semicoiled", FORMS, "form that reversed motors lead to")
+    second: str = choice("none", ("none", *FORMS), "form that joints in the target form go on to, from the root")
+    second_rate: float = number(
+        0.68, "1/s", 0, 1e6, "rate at which a filament begins to, while its motor winds it up; drawn with motor.seed"
+    )
     semicoiled: tuple[float, float, float] = vector((0.0, 2.84, 2.29), "1/um", -100, 100, "strain of that form")
     curly_1: tuple[float, float, float] = vector((0.0, 2.61, 4.19), "1/um", -100, 100, "strain of that form")
     coiled: tuple[float, float, float] = vector((0.0, 1.82, -0.6), "1/um", -100, 100, "strain of that form")

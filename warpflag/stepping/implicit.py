@@ -24,6 +24,7 @@ from warpflag_kernels.implicit import (
     stability,
     step_flow,
 )
+from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, polymorphs
 from warpflag_kernels.stepping import balance, dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
@@ -98,8 +99,7 @@ class ImplicitStepper:
     Attributes:
         data: the struct `Implicit`.
         steps: the struct `StepControl`.
-        balanced: whether the power balance of every step is asked for.
-        balance: the struct `Balance`.
+        balance: the struct `Balance`: the power balance of every step is asked for.
         stability: the struct `Stability`; None where nodes cause no flows.
         history: increments of the last two steps.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the pose that was linearised last.
@@ -119,11 +119,7 @@ class ImplicitStepper:
         self.contacts = contact_list.allocate(model, self._touching)
         self.law, self.flow = delassus.allocate(model, self.contacts), step_flow.allocate(model)
         quasi_newton.allocate(model, self.contacts, self.law)
-        self.data, self.balanced, self.balance = (
-            collocation.allocate(model),
-            balance.holds(model),
-            balance.allocate(model),
-        )
+        self.data, self.balance = collocation.allocate(model), balance.allocate(model)
         self._motor_law, self._motors = model.switches.has("motor law"), motor_solve.allocate(model)
         fixed = [scene.numerics.time_step for scene in scenes]
         self.steps = allocated_control(scenes, [bool(f) for f in fixed], model.device)
@@ -143,7 +139,7 @@ class ImplicitStepper:
         s, i, band, x = self._system, self.data, self.band, self._scratch
         model, state, pose, device = s.model, s.state, s.state.data.pose, s.model.device
         last, before = self.history.last, self.history.before
-        k = collocation.kernels(model.precision, self.balanced)
+        k = collocation.kernels(model.precision)
         inputs = [model.data, state.data, self.steps, s.control, i, band, self.contacts, self.law]
         wp.launch(k.begin, model.cell_count, inputs=inputs, device=device)
         if model.timed:
@@ -170,8 +166,7 @@ class ImplicitStepper:
         if self._touching:
             search.renew(model, state, pose, self.contacts)
         self._evaluate()
-        if self.balanced:
-            balance.gather(model, state, self.balance)
+        balance.gather(model, state, self.balance)
         solution = self._solve(x.last_at_second, x.found, first=False)
         inputs = [model.data, state.data, x.last_at_second, x.found, x.expected, solution]
         inputs += [i, x.total, x.remaining, s.chart]
@@ -179,8 +174,8 @@ class ImplicitStepper:
         moved = self._moved_history
         transported = (x.total, x.last_at_second, moved.last, moved.before)
         chain_chart.retract(model, state, pose, i.one, x.remaining, pose, transported)
-        if self.balanced:
-            balance.weigh(model, state, x.total, self.balance)
+        balance.weigh(model, state, x.total, self.balance)
+        balance.add_up_ramps(model, state, s.chart, s.control, self.balance)
         # What was found is judged, and kept or dropped.
         health.check(model, state, s.chart, s.guard, s.control, self.contacts if self._touching else None)
         inputs = [model.data, state.data, band, self.contacts, self.law, s.chart, s.control, self.steps, i]
@@ -193,6 +188,7 @@ class ImplicitStepper:
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
         polymorphs.flip(model, state, s.chart, s.control, counted=True)
+        hook.follow(model, state, s.chart)
         if self.stability is not None:
             stability.schedule(model, state, i.evaluations, i.accepted, s.control.longest_step, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)
@@ -224,7 +220,7 @@ class ImplicitStepper:
         """
         model, state, x = self._system.model, self._system.state, self._scratch
         inputs = [model.data, state.data, self.data, self.band, self.law, last, found, x.free]
-        kernel = collocation.kernels(model.precision, self.balanced).right_hand_side
+        kernel = collocation.kernels(model.precision).right_hand_side
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
         linearised.solve(model, state, self.band, x.free)
         if self._touching:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
+from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import comoving_chart, polymorphs, reconstruction
 from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays
 from warpflag_kernels.stepping.frame_slots import DenseOutput
@@ -85,6 +86,7 @@ class RkcStepper:
         comoving_chart.commit(s.model, s.state, s.chart)
         health.remember(s.model, s.state, s.chart, s.guard, s.control)
         polymorphs.flip(s.model, s.state, s.chart, s.control, counted=False)
+        hook.follow(s.model, s.state, s.chart)
         if not self._euler:
             comoving_chart.fit_flagellum_spin(s.model, s.state, s.chart)
 

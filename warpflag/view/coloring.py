@@ -106,7 +106,7 @@ class Coloring:
     @cached_property
     def highest(self) -> float:
         """The value of the last colour; the first one's is 0."""
-        bend = np.hypot(*self.scene.flagella.intrinsic_curvature[:2])
+        bend = np.hypot(*self.scene.flagella.ground_strain[:2])
         return float(
             {
                 "flagellum": len(self.record.first_node) - 2,

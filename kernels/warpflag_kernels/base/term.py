@@ -51,8 +51,6 @@ class Term:
             found with that of another term.
         stiffness: sets or adds to the second derivatives of the energy in the matrix of an implicit step,
             `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
-        balanced: whether the power balance of a step holds with it: not with random forces, nor where what it stores
-            changes at a pose that stands still.
         within_step: the term that stands for this one in an implicit step. None: itself.
         timed: whether it depends on time itself, `State.time`.
     """
@@ -63,7 +61,6 @@ class Term:
     contact: bool = False
     linearised: "Term | None" = None
     stiffness: Callable[..., None] | None = None
-    balanced: bool = True
     within_step: "Term | None" = None
     timed: bool = False
 

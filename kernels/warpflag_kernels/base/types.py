@@ -57,13 +57,16 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Polymorphs:
-        """Two forms of every joint, see rod/polymorphs.py; per flagellum [K] unless said otherwise."""
+        """Three forms of every joint, see rod/polymorphs.py; per flagellum [K] unless said otherwise."""
 
-        rest_strain: wp.array(dtype=vec3)  # [2 E], h Omega^0 of form 0 and of form 1 of every joint [rad]
+        rest_strain: wp.array(dtype=vec3)  # [3 E], h Omega^0 of forms 0, 1 and 2 of every joint [rad]
         ramp: wp.array(dtype=wp.float64)  # in which a ground state changes [s]
         # Moments beyond which joints flip to form 1, and below which they flip back [pN um].
         nucleation: wp.array(dtype=wp.vec2d)  # at root and tip
         propagation: wp.array(dtype=wp.vec2d)  # beside a joint of the other form
+        # When joints of form 1 go on to form 2.
+        first_second: wp.array(dtype=wp.int32)  # [K + 1], flagellum k has the intervals from first_second[k] on
+        second: wp.array(dtype=wp.vec2d)  # [intervals], beginning and end [s]
 
     @wp.struct
     class Hook:
@@ -149,12 +152,14 @@ def structs(p: Precision) -> SimpleNamespace:
         torque: wp.array(dtype=real)  # at the moment evaluated [pN um]
         held: wp.array(dtype=real)  # in an implicit step [pN um]
         slope: wp.array(dtype=real)  # of the piece of its curve that it was on last [pN um s]
+        on_hook: wp.array(dtype=real)  # at the end of the last step; only with a hook that stiffens by it [pN um]
 
     @wp.struct
     class Forms:
         """Forms of the joints [E]; only with polymorphs."""
 
-        form: wp.array(dtype=wp.int32)  # 0 or 1
+        form: wp.array(dtype=wp.int32)  # 0, 1 or 2
+        before: wp.array(dtype=wp.int32)  # form before it flipped last
         changed: wp.array(dtype=wp.float64)  # when it flipped last [s]
         rest_strain: wp.array(dtype=vec3)  # the array of `Rod`, which changes with time here [rad]
 
@@ -286,8 +291,10 @@ def allocate_state(model: DeviceModel) -> Any:
     if model.switches.has("motor law"):
         for name in ("torque", "held", "slope"):
             setattr(s.motor, name, zeros(flagella, p.real))
+        if model.switches.has("hook that stiffens"):
+            s.motor.on_hook = wp.clone(model.data.motor.torque)
     if model.switches.has("polymorphs"):
-        s.forms.form = zeros(elements, wp.int32)
+        s.forms.form, s.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
         s.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
         s.forms.rest_strain = model.data.rod.rest_strain
     return s

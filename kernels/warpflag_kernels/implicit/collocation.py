@@ -94,8 +94,8 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def kernels(p: Precision, balanced: bool) -> SimpleNamespace:
-    """The kernels; those of a model whose steps are asked for their power balance, or not."""
+def kernels(p: Precision) -> SimpleNamespace:
+    """The kernels."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Implicit = chart_stage.struct(p), struct(p)
@@ -107,7 +107,7 @@ def kernels(p: Precision, balanced: bool) -> SimpleNamespace:
     allowed, asked, accept, next_step, smallest = f.allowed, f.asked, f.accept, f.next_step, f.smallest
     add_estimate = accuracy.functions(independent=True).add
     advanced = clock.functions().advanced
-    module = p.module("collocation", "balanced" if balanced else "")
+    module = p.module("collocation")
     Balance, keeps, counted = balance.struct(p), balance.functions(p).kept, balance.functions(p).count
     round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
     theta_inside, per_predictor = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(ERROR_PER_PREDICTOR))
@@ -311,14 +311,11 @@ def kernels(p: Precision, balanced: bool) -> SimpleNamespace:
         error = per_predictor * truncated * predictor_error / wp.float64(nodes)
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
-        kept = bool(True)
-        energy = wp.float64(0.0)
         lasts = bool(False)
-        if wp.static(balanced):
-            kept, energy = keeps(model, powers, c, dt, wp.max(round_off, asked(steps, c, dt)))
-            if sound and powers.known[c] != 0:
-                lasts = counted(powers, c, kept)
-            sound = sound and kept
+        kept, energy = keeps(model, powers, c, dt, wp.max(round_off, asked(steps, c, dt)))
+        if sound and powers.known[c] != 0:
+            lasts = counted(powers, c, kept)
+        sound = sound and kept
         known = imp.history[c] == 2
         if accept(steps, c, dt, error, wp.float64(0.0), sound, known):
             if known and add_estimate(steps.achieved, c, dt, error, advanced(control, c), steps.shortest[c]):

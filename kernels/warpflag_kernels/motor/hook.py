@@ -9,7 +9,8 @@ segment 1, as a pair of forces across its tangent and a torque about it, and -t_
 is in `rod/elastic.py`. The second derivatives of the bending are added to those of joint 0, so the linearised elastic
 term has the change of these forces, too.
 
-The stiffening takes the motor's torque as a given number: it is no part of the derivatives.
+The stiffening takes the motor's torque as a given number, where that is not constant the one at the end of the last
+step: it is no part of the derivatives.
 """
 
 import functools
@@ -22,7 +23,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.motor import torque
-from warpflag_kernels.rod import hessian
+from warpflag_kernels.rod import comoving_chart, hessian
 
 
 @functools.cache
@@ -44,7 +45,10 @@ def joint(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def stiffness(model: Model, state: State, k: wp.int32):
         """k of flagellum k [pN um/rad]."""
-        stiffening = model.hook.stiffening[k] * wp.abs(motor_torque(model, state, k))
+        torque = motor_torque(model, state, k)
+        if state.motor.on_hook.shape[0] > 0:
+            torque = state.motor.on_hook[k]
+        stiffening = model.hook.stiffening[k] * wp.abs(torque)
         return model.hook.stiffness[k] * (real(1.0) + stiffening)
 
     @wp.func(module=module)
@@ -115,6 +119,7 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
+    Chart = comoving_chart.struct(p)
     helix_axis, stiffness, axis_rates = joint(p).helix_axis, joint(p).stiffness, joint(p).axis_rates
     module = p.module("hook")
 
@@ -183,7 +188,21 @@ def _kernels(p: Precision) -> SimpleNamespace:
         spin = around * wp.dot(by_spin, by_spin) + along * cosine_by_spin * cosine_by_spin
         out.spins[i] = out.spins[i] + vec3(real(0.0), real(0.0), spin)
 
-    return SimpleNamespace(energies=energies, add_stiffness=add_stiffness)
+    @wp.kernel(module=module)
+    def follow(
+        # Model:
+        model: Model,
+        # State:
+        chart: Chart,
+        # Out:
+        state: State,
+    ):
+        k = wp.tid()
+        c = model.cell_of[model.first_node[k]]
+        if state.active[c] != 0 and chart.commit[c] != 0:
+            state.motor.on_hook[k] = state.motor.torque[k]
+
+    return SimpleNamespace(energies=energies, add_stiffness=add_stiffness, follow=follow)
 
 
 def add_energy(model: DeviceModel, state: DeviceState, energy_out: wp.array) -> None:
@@ -198,4 +217,14 @@ def add_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> Non
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, stiffness], device=model.device)
 
 
+def follow(model: DeviceModel, state: DeviceState, chart: Any) -> None:
+    """Has hooks that stiffen take the torques of their motors; a part of a pass, after the step is committed."""
+    if model.switches.has("hook that stiffens"):
+        kernel = _kernels(model.precision).follow
+        wp.launch(kernel, model.flagellum_count, inputs=[model.data, chart, state.data], device=model.device)
+
+
 HOOK = Term("hook", functions=functions, stiffness=add_stiffness)
+
+HOOK_THAT_STIFFENS = Term("hook that stiffens")
+"""No force of its own: the hook goes by what the motor does, whose torque is not constant."""

@@ -1,6 +1,6 @@
-"""Polymorphs: every joint of a flagellum is in one of two forms, helices of their own, and flips between them.
+"""Polymorphs: every joint of a flagellum is in one of three forms, helices of their own, and flips between them.
 
-The forms are that of the scene's ground state, 0, and a target, 1. What flips a joint is the moment about the helix
+The forms are that of the scene's ground state, 0, a target, 1, and one that joints of the target go on to, 2. What flips a joint is the moment about the helix
 axis against the handedness of form 0, as a reversed motor winds a filament up. Joints near the root or the tip flip by
 themselves (nucleation) when their moment along the ground state,
 
@@ -9,7 +9,11 @@ themselves (nucleation) when their moment along the ground state,
 exceeds one threshold, and back when it falls below another; in a helix that is wound up uniformly it is the moment
 about the axis. Any joint flips beside one of the other form (propagation) at lower thresholds. There the local m would
 not do: a joint of semicoiled form amid the normal one has an eighth of it, and a kinked filament is bent by its
-thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels.
+thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels; near
+the ends over less, as much to either side, so that it is the moment at the joint.
+
+From some moment on that the scene has drawn, joints of form 1 go on to form 2, one after the other from the root, as
+long as the motor winds up. They flip back to form 0 as those of form 1 do.
 
 A joint's ground state goes over within a ramp, as a smooth step, so that the steppers see quadratic energies that
 change with time. Joints are looked at where a step has been accepted, and neither flip nor lead to a flip while their
@@ -46,15 +50,20 @@ def functions(p: Precision) -> SimpleNamespace:
     module = p.module("polymorph_functions")
 
     @wp.func(module=module)
-    def ramped(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32):
-        """Sets the ground state of joint e."""
-        own = model.polymorphs.rest_strain[2 * e + state.forms.form[e]]
-        share = (state.time[c] - state.forms.changed[e]) / model.polymorphs.ramp[k]
+    def ground_state(model: Model, state: State, e: wp.int32, k: wp.int32, time: wp.float64):
+        """Ground state of joint e at a time [rad]."""
+        own = model.polymorphs.rest_strain[3 * e + state.forms.form[e]]
+        share = (time - state.forms.changed[e]) / model.polymorphs.ramp[k]
         if share < wp.float64(1.0):
             s = p.real(wp.max(share, wp.float64(0.0)))
             s = s * s * (p.real(3.0) - p.real(2.0) * s)
-            own = (p.real(1.0) - s) * model.polymorphs.rest_strain[2 * e + 1 - state.forms.form[e]] + s * own
-        state.forms.rest_strain[e] = own
+            own = (p.real(1.0) - s) * model.polymorphs.rest_strain[3 * e + state.forms.before[e]] + s * own
+        return own
+
+    @wp.func(module=module)
+    def ramped(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32):
+        """Sets the ground state of joint e to that at the time of the evaluation."""
+        state.forms.rest_strain[e] = ground_state(model, state, e, k, state.time[c])
 
     @wp.func(module=module)
     def in_flagellum(model: Model, state: State, k: wp.int32, c: wp.int32):
@@ -63,7 +72,7 @@ def functions(p: Precision) -> SimpleNamespace:
             ramped(model, state, e, k, c)
             e += 1
 
-    return SimpleNamespace(ramped=ramped, in_flagellum=in_flagellum)
+    return SimpleNamespace(ramped=ramped, in_flagellum=in_flagellum, ground_state=ground_state)
 
 
 @functools.cache
@@ -98,36 +107,41 @@ def _kernels(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32):
         """Moment of joint e along its ground state, against the handedness of form 0 [pN um]."""
-        rest = model.polymorphs.rest_strain[2 * e + state.forms.form[e]]
+        rest = model.polymorphs.rest_strain[3 * e + state.forms.form[e]]
         d = strain_change(model, state, chart, e)
         a = model.rod.bending_rigidity[k]
         moment = vec3(a * d[0], a * d[1], model.rod.twist_rigidity[k] * d[2])
         m = -wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k])
-        if rest[2] * model.polymorphs.rest_strain[2 * e][2] < real(0.0):
+        if rest[2] * model.polymorphs.rest_strain[3 * e][2] < real(0.0):
             m = -m
         return wp.float64(m)
 
     @wp.func(module=module)
     def axial_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, root: wp.int32, tip: wp.int32):
-        """Moment about the helix axis around joint e, of the mean over a turn, against the handedness of form 0."""
-        rest = model.polymorphs.rest_strain[2 * e]
+        """Moment about the helix axis at joint e against the handedness of form 0 [pN um].
+
+        The axis is the mean tangent over a turn around e, at the ends over the first or the last one.
+        """
+        rest = model.polymorphs.rest_strain[3 * e]
         half = wp.int32(half_turn / wp.length(rest))
         moment = vec3(real(0.0))
         along = vec3(real(0.0))
         count = real(0.0)
-        j = wp.max(wp.min(e - half, tip - 2 * half), root)  # at the ends the first and the last whole turn
+        beside = wp.min(e - root, tip - e)
+        j = wp.max(wp.min(e - half, tip - 2 * half), root)
         last = wp.min(wp.max(e + half, root + 2 * half), tip)
         a = model.rod.bending_rigidity[k]
         c = model.rod.twist_rigidity[k]
         while j <= last:
             t = chart.base.tangent[j]
             u = chart.base.tangent[j + 1]
-            a1 = chart.base.director[j] + chart.base.director[j + 1]
-            a2 = wp.cross(t, chart.base.director[j]) + wp.cross(u, chart.base.director[j + 1])
-            d = strain_change(model, state, chart, j)
             along += t + u
-            moment += real(0.5) * (a * d[0] * a1 + a * d[1] * a2 + c * d[2] * (t + u))
-            count += real(1.0)
+            if wp.abs(j - e) <= beside:
+                a1 = chart.base.director[j] + chart.base.director[j + 1]
+                a2 = wp.cross(t, chart.base.director[j]) + wp.cross(u, chart.base.director[j + 1])
+                d = strain_change(model, state, chart, j)
+                moment += real(0.5) * (a * d[0] * a1 + a * d[1] * a2 + c * d[2] * (t + u))
+                count += real(1.0)
             j += 1
         m = wp.abs(wp.dot(moment, wp.normalize(along))) / (count * model.rod.segment_length[k])
         i = model.first_node[k]
@@ -164,32 +178,48 @@ def _kernels(p: Precision) -> SimpleNamespace:
         reach = 1 + wp.int32(real(end_length) / model.rod.segment_length[k])
         nucleation = model.polymorphs.nucleation[k]
         propagation = model.polymorphs.propagation[k]
-        before = int(2)  # form of the joint before, as it was; 2: on its ramp, or none
+        goes_on = bool(False)
+        i = model.polymorphs.first_second[k]
+        while i < model.polymorphs.first_second[k + 1]:
+            if now >= model.polymorphs.second[i][0] and now < model.polymorphs.second[i][1]:
+                goes_on = True
+            i += 1
+        # Of the joint before, as it was: whether it has left form 0, 2 on its ramp or where there is none; its form.
+        before = int(2)
+        form_before = int(2)
         e = root
         while e <= tip:
             form = state.forms.form[e]
-            own = int(form)
+            left = wp.min(form, 1)
+            own = int(left)
+            own_form = int(form)
             if state.forms.changed[e] > rest:
                 own = 2
+                own_form = 0
             else:
                 after = int(2)
                 if e < tip and state.forms.changed[e + 1] <= rest:
-                    after = state.forms.form[e + 1]
+                    after = wp.min(state.forms.form[e + 1], 1)
                 ends = e - root < reach or tip - e < reach
-                led = before == 1 - form or after == 1 - form
+                led = before == 1 - left or after == 1 - left
                 over = bool(False)
                 if led:
                     m = axial_moment(model, state, chart, e, k, root, tip)
-                    over = (form == 0 and m > propagation[0]) or (form == 1 and m < propagation[1])
-                elif ends and (e == root or before == form) and (e == tip or after == form):
-                    if form == 0:
+                    over = (left == 0 and m > propagation[0]) or (left == 1 and m < propagation[1])
+                elif ends and (e == root or before == left) and (e == tip or after == left):
+                    if left == 0:
                         over = end_moment(model, state, chart, e, k) > nucleation[0]
                     else:
                         over = axial_moment(model, state, chart, e, k, root, tip) < nucleation[1]
                 if over:
-                    state.forms.form[e] = 1 - form
+                    state.forms.form[e] = 1 - left
+                elif form == 1 and goes_on and form_before == 2:
+                    state.forms.form[e] = 2
+                if state.forms.form[e] != form:
+                    state.forms.before[e] = form
                     state.forms.changed[e] = now
             before = own
+            form_before = own_form
             e += 1
 
     return SimpleNamespace(ground_states=ground_states, flip=flip)
@@ -213,4 +243,4 @@ def flip(model: DeviceModel, state: DeviceState, chart: Any, control: Any, count
         wp.launch(_kernels(model.precision).flip, model.flagellum_count, inputs=inputs, device=model.device)
 
 
-POLYMORPHS = Term("polymorphs", launch=ground_states, functions=functions, timed=True, balanced=False)
+POLYMORPHS = Term("polymorphs", launch=ground_states, functions=functions, timed=True)

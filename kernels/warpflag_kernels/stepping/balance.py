@@ -14,6 +14,11 @@ that nothing puts in, long before any value looks wrong. A term that states no e
 none can be forgotten.
 
 The first step after a start has no energy before it and is not judged.
+
+Where ground states change with time, on the ramps of polymorphs, energy is put in at a pose that stands still: in a step
+-m.change, joint by joint, with the mean m of the moments before and after. Stiff joints follow their ground state, so
+that with the moment before alone they would seem to take in and dissipate k change^2/2, and with that after to give as
+much away. With any moment between the two it differs by at most |dm|.|change|/2, which is allowed, too.
 """
 
 import functools
@@ -23,10 +28,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warpflag_kernels.base import clock
+from warpflag_kernels.base.clock import Control
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.rod import chain_chart, comoving_chart, polymorphs, rotations
 
 # What a step may dissipate over the power of its velocities: 1.2 at most in sound runs. Velocities of stiff modes are
 # those before the step's last correction, so they may exceed what is dissipated by far.
@@ -53,6 +60,9 @@ def struct(p: Precision) -> Any:
         work: wp.array(dtype=wp.float64)  # [K], of the terms that store no energy [pN um]
         energy: wp.array(dtype=wp.float64)  # [K], after the step [pN um]
         stored: wp.array(dtype=wp.float64)  # [C], before it [pN um]
+        # Where ground states change, what that adds to the energy in the step.
+        ramped: wp.array(dtype=wp.float64)  # [K] [pN um]
+        ramped_within: wp.array(dtype=wp.float64)  # [K], to within this [pN um]
         known: wp.array(dtype=wp.int32)  # [C], 1: `stored` is that of the present state
         refused: wp.array(dtype=wp.int32)  # [C], steps that violated the balance so far
         lasting: wp.array(dtype=wp.int32)  # [C], WEIGHT times these, less the steps that have kept it
@@ -64,9 +74,9 @@ MEMORY = ("stored", "known", "refused", "lasting")
 """What goes on from step to step."""
 
 
-def holds(model: DeviceModel) -> bool:
-    """Whether the balance can be asked of the model's steps: every term is a force or states its energy."""
-    return all(term.balanced for term in model.terms)
+def ramps(model: DeviceModel) -> bool:
+    """Whether ground states change with time."""
+    return model.switches.has("polymorphs")
 
 
 def allocate(model: DeviceModel) -> Any:
@@ -77,6 +87,9 @@ def allocate(model: DeviceModel) -> Any:
     b.body = wp.zeros(model.flagellum_count, dtype=chain_chart.types(p).vec6, device=device)
     for name in ("power", "load", "work", "energy"):
         setattr(b, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
+    if ramps(model):
+        for name in ("ramped", "ramped_within"):
+            setattr(b, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
     b.stored = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
     for name in ("known", "refused", "lasting"):
         setattr(b, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
@@ -194,6 +207,8 @@ def functions(p: Precision) -> SimpleNamespace:
         power = zero
         load = zero
         all_off = zero
+        stored = balance.stored[c]
+        ramped_within = zero
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
             work += balance.work[k]
@@ -204,9 +219,12 @@ def functions(p: Precision) -> SimpleNamespace:
             bend = wp.float64(model.rod.bending_rigidity[k]) + wp.float64(model.rod.twist_rigidity[k])
             each = wp.float64(0.5) * (wp.float64(model.rod.stretching_stiffness[k]) * h + bend / h)
             all_off += wp.float64(model.first_node[k + 1] - model.first_node[k] - 1) * each
+            if balance.ramped.shape[0] > 0:
+                stored += balance.ramped[k]
+                ramped_within += balance.ramped_within[k]
             k += 1
-        within = load * error + round_off * wp.sqrt(wp.max(energy, balance.stored[c]) * all_off)
-        dissipated = work - (energy - balance.stored[c])
+        within = ramped_within + load * error + round_off * wp.sqrt(wp.max(energy, stored) * all_off)
+        dissipated = work - (energy - stored)
         good = dissipated > -within and dissipated < most * power * dt + within
         return good or balance.known[c] == 0, energy
 
@@ -244,3 +262,72 @@ def weigh(model: DeviceModel, state: DeviceState, total: Any, balance: Any) -> N
     """
     kernel = _kernels(model.precision, storing(model)).weigh
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, total, balance], device=model.device)
+
+
+@functools.cache
+def _ramp_kernel(p: Precision) -> Any:
+    """Kernel of ground states that change."""
+    real, vec3 = p.real, p.vec3
+    Model, State, Balance, Chart = structs(p).Model, structs(p).State, struct(p), comoving_chart.struct(p)
+    joint_strain, ground_state = rotations.functions(p).joint_strain, polymorphs.functions(p).ground_state
+    advanced = clock.functions().advanced
+    half = wp.constant(real(0.5))
+
+    @wp.kernel(module=p.module("balance_ramps"))
+    def add_up(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        control: Control,
+        # Out:
+        balance: Balance,
+    ):
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if state.active[c] == 0:
+            return
+        a = model.rod.bending_rigidity[k]
+        stiffness = vec3(a, a, model.rod.twist_rigidity[k]) / model.rod.segment_length[k]
+        total = wp.float64(0.0)
+        within = wp.float64(0.0)
+        stored = wp.float64(0.0)
+        e = first + 1
+        while e + 1 < model.first_node[k + 1]:
+            at_start = ground_state(model, state, e, k, control.time[c])
+            at_end = ground_state(model, state, e, k, advanced(control, c))
+            change = at_end - at_start
+            if wp.length_sq(change) > real(0.0):
+                before = joint_strain(
+                    chart.base.tangent[e], chart.base.tangent[e + 1], chart.base.director[e], chart.base.director[e + 1]
+                )
+                after = joint_strain(
+                    state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
+                )
+                scaled = half * wp.cw_mul(stiffness, change)
+                total -= wp.float64(wp.dot(scaled, before - at_start + after - at_end))
+                d = wp.cw_mul(scaled, after - before - change)
+                within += wp.float64(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]))
+                evaluated = state.forms.rest_strain[e]
+                later = wp.cw_mul(stiffness, evaluated - at_end)
+                stored += wp.float64(wp.dot(later, after - half * (evaluated + at_end)))
+            e += 1
+        balance.ramped[k] = total
+        balance.ramped_within[k] = within
+        balance.energy[k] = balance.energy[k] + stored
+
+    return add_up
+
+
+def add_up_ramps(model: DeviceModel, state: DeviceState, chart: Any, control: Any, balance: Any) -> None:
+    """What changes of ground states have added to the energy in a step, and the energy with those at its end.
+
+    Args:
+        model, state, chart, control: of the batch; after `weigh`, before the step is judged.
+        balance: struct `Balance`.
+    """
+    if ramps(model):
+        inputs = [model.data, state.data, chart, control, balance]
+        wp.launch(_ramp_kernel(model.precision), model.flagellum_count, inputs=inputs, device=model.device)

@@ -2,7 +2,7 @@
 
 from warpflag_kernels.base.term import Term
 from warpflag_kernels.contact.pair_forces import BODY_CONTACT, STERIC, STERIC_WITH_SELF
-from warpflag_kernels.motor.hook import HOOK
+from warpflag_kernels.motor.hook import HOOK, HOOK_THAT_STIFFENS
 from warpflag_kernels.motor.laws import MOTOR_LAW
 from warpflag_kernels.motor.torque import MOTOR
 from warpflag_kernels.rod.elastic import BEARING, ELASTIC
@@ -11,8 +11,8 @@ from warpflag_kernels.rod.free_end import FREE_END
 from warpflag_kernels.rod.polymorphs import POLYMORPHS
 
 TERMS = (
-    *(MOTOR, MOTOR_LAW, POLYMORPHS, ELASTIC, BEARING, HOOK, STERIC, STERIC_WITH_SELF),
-    *(BODY_CONTACT, EXTERNAL, FREE_END),
+    *(MOTOR, MOTOR_LAW, POLYMORPHS, ELASTIC, BEARING, HOOK, HOOK_THAT_STIFFENS),
+    *(STERIC, STERIC_WITH_SELF, BODY_CONTACT, EXTERNAL, FREE_END),
 )
 
 

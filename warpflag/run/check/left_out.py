@@ -94,7 +94,7 @@ def self_contact(scene: Scene, stiff: Turning) -> str | None:
     """Turns of the helix at rest beside each other."""
     if _has(scene, "steric.self_contact") or not scene.steric.enabled:
         return None
-    _o1, o2, o3 = scene.flagella.intrinsic_curvature
+    _o1, o2, o3 = scene.flagella.ground_strain
     strain = math.hypot(_o1, o2, o3)
     if strain == 0.0:
         return None

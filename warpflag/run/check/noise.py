@@ -34,6 +34,6 @@ def of_noise(scene: Scene, step: float) -> list[str]:
 
 def _axial_share(scene: Scene) -> float:
     """Axial length of the helix at rest over its contour length."""
-    curvature = np.array(scene.flagella.intrinsic_curvature)
+    curvature = np.array(scene.flagella.ground_strain)
     size = float(np.linalg.norm(curvature))
     return abs(float(curvature[2])) / size if size else 1.0

@@ -57,7 +57,7 @@ def _winds_up(scene: Scene, spec: FlagellumSpec) -> bool:
 
 def _in_reverse(scene: Scene, spec: FlagellumSpec) -> bool:
     """Whether the sense that winds up is the motor's second."""
-    return spec.torque * scene.flagella.intrinsic_curvature[2] <= 0.0
+    return spec.torque * scene.flagella.ground_strain[2] <= 0.0
 
 
 def _torque_held(scene: Scene, spec: FlagellumSpec) -> float:
