@@ -174,6 +174,21 @@ def test_at_rest_the_hook_is_straight_where_helix_and_motor_axis_agree(on_axis, 
     assert sim.cell_state().elastic_energy.sum() < 1e-24
 
 
+@pytest.mark.parametrize("stepper", ["implicit", "rkc"])
+def test_a_hook_stiffens_by_the_torque_of_the_law_and_a_stopped_run_goes_on_with_the_same_bits(stepper, device):
+    law = {"motor.law": "torque_speed", "motor.torque": 1.26, "motor.knee": 50.0, "motor.no_load": 200.0}
+    scene = cell({**HOOK, **law, "hook.stiffening_torque": 0.5, "numerics.stepper": stepper})
+    whole, first, second = (Simulation(scene, device=device, strict=True) for _ in range(3))
+    for time in (1e-3, 1.2e-3):
+        whole.advance(time)
+    torques = whole.system.state.data.motor.on_hook.numpy()
+    assert np.abs(torques - whole.evaluate().motor_torques).max() < 0.02 < 0.3 < np.abs(torques - 1.26).max()
+    first.advance(1e-3)
+    second.restore(first.checkpoint())
+    second.advance(1.2e-3)
+    assert np.array_equal(second.state.positions, whole.state.positions)
+
+
 def test_nonsense_is_refused_by_name():
     for values, key in (
         ({"hook.stiffness": 1.0, "motor.bearing_torque": False}, "hook.stiffness"),
@@ -188,3 +203,6 @@ def test_without_stiffness_nothing_is_allocated_and_the_terms_are_those_of_befor
     bare = Simulation(cell({"hook.length": 0.055}), device=device).system.model
     assert bare.data.hook.stiffness is None and "hook" not in [term.name for term in bare.terms]
     assert "hook" in [term.name for term in Simulation(cell(HOOK), device=device).system.model.terms]
+    constant = Simulation(cell({**HOOK, "hook.stiffening_torque": 0.5}), device=device)
+    on_hook = constant.system.state.data.motor.on_hook
+    assert on_hook is None or on_hook.size == 0

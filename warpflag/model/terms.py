@@ -163,8 +163,9 @@ SCENE_TERMS = (
     SceneTerm("hook", lambda scene: scene.hook.stiffness > 0.0 and scene.body.enabled, fill=_fill_hook),
     SceneTerm(
         "hook that stiffens",
-        lambda scene: bool(scene.hook.stiffening_torque and scene.hook.stiffness and scene.body.enabled)
-        and not _plain(scene),
+        lambda scene: (
+            bool(scene.hook.stiffening_torque and scene.hook.stiffness and scene.body.enabled) and not _plain(scene)
+        ),
     ),
     SceneTerm("steric", lambda scene: scene.steric.enabled and not scene.steric.self_contact and _several(scene)),
     SceneTerm("steric with self", lambda scene: scene.steric.enabled and scene.steric.self_contact),

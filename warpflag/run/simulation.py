@@ -36,6 +36,7 @@ _SECONDS_PER_REPLAY = 0.2
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
 # Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
 _KEPT_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
+_KEPT_FORMS = ("form", "before", "changed")
 _KEPT_CHART = ("flagellum_spin", "motor_angle", "body_angle")
 
 
@@ -342,8 +343,7 @@ class Simulation:
         if self.system.model.switches.steric:
             carried["guard.position"] = self.system.guard.position
         if self.system.model.switches.has("polymorphs"):
-            forms = self.system.state.data.forms
-            carried |= {f"forms.{name}": getattr(forms, name) for name in ("form", "before", "changed")}
+            carried |= {f"forms.{name}": getattr(self.system.state.data.forms, name) for name in _KEPT_FORMS}
         if self.system.model.switches.has("hook that stiffens"):
             carried["motor.on_hook"] = self.system.state.data.motor.on_hook
         return carried

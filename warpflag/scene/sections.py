@@ -209,7 +209,7 @@ class Hook(Section, key="hook"):
 class Polymorphs(Section, key="polymorphs"):
     """Forms that the filament changes to under its own moment, joint by joint: those of a bacterial flagellum.
 
-    Rate of going on to the second form: Mears et al., eLife 3, e01916 (2014), for curly-1, as used in models built on it.
+    Rate of going on to the second form: that to curly-1 in models built on Mears et al., eLife 3, e01916 (2014).
     Moments are about the helix axis, against the handedness of the ground state, as a reversed motor winds it up.
     Thresholds of nucleation: Hotani, J. Mol. Biol. 156, 791 (1982). Those of propagation lie on both sides of the
     middle of these two, which is a choice. Strains of the target: from pitch and radius, semicoiled and curly-1 with

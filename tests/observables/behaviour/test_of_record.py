@@ -9,7 +9,7 @@ import pytest
 
 from tests.runs import executed, small, summary
 from tests.shapes import Zipping
-from warpflag.observables.behaviour import of_record
+from warpflag.observables.behaviour import load, of_record
 from warpflag.record import Record
 from warpflag.run import sweep
 from warpflag.run.summary import plain
@@ -41,6 +41,15 @@ def test_a_made_up_record(made):
     assert numbers["bundles"] == {"count": 1.0, "members": 1.0}
     assert numbers["motor_drag"] == pytest.approx([3.4 / (2 * np.pi * 400.0)] * 2)
     json.dumps(plain(numbers), allow_nan=False)
+
+
+def test_motor_loads_of_a_law_lie_on_its_curve(tmp_path):
+    law = {"motor.law": "torque_speed", "motor.torque": 1.26, "motor.knee": 50.0, "motor.no_load": 200.0}
+    directory = executed(small({**law, "duration": 4e-3, "frames": 80}), tmp_path / "law")
+    with Record(directory) as record:
+        for point in record.motor_loads():
+            assert 0.0 < point.torque < 1.2
+            assert point.torque == pytest.approx(load.torque_at(point.rate, 1.26, 50.0, 200.0), rel=0.02)
 
 
 def test_the_summary_and_a_sweeps_table_hold_it_where_the_scene_asks(tmp_path):

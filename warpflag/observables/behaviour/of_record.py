@@ -68,7 +68,7 @@ def wobble(
 
 
 def motor_loads(record: Record, start: float | None = None, stop: float | None = None) -> list[LoadPoint]:
-    """Rate, torque and drag at which each motor works.
+    """Rate, torque and drag at which each motor works; torques that are not constant are those of the record.
 
     Args:
         record: of the run.
@@ -80,7 +80,11 @@ def motor_loads(record: Record, start: float | None = None, stop: float | None =
         RecordError: the record can't be read.
     """
     window = record.window(start, stop)
-    torques = [spec.torque for spec in loads(record.scene_text).resolved_flagella()]
+    measured = record.observables.get("motor_torque")
+    if measured is None:
+        torques = np.array([spec.torque for spec in loads(record.scene_text).resolved_flagella()])
+    else:
+        torques = (measured[window][1:] + measured[window][:-1]) / 2
     return load.load_points(record.times[window], record.motor_angle[window], torques)
 
 

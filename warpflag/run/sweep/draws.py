@@ -77,6 +77,8 @@ class Draws:
                 values |= {f"flagellum.{k}.azimuth": azimuth, f"flagellum.{k}.anchor_offset": offset}
         if scene.fluid.temperature > 0.0 and (draw or repeat):
             values["fluid.seed"] = int(self._stream("fluid.seed", draw, repeat).integers(2**31))
+        if scene.motor.switching == "markov" and (draw or repeat):
+            values["motor.seed"] = int(self._stream("motor.seed", draw, repeat).integers(2**31))
         return values
 
     def _stream(self, key: str, draw: int, repeat: int | None = None) -> np.random.Generator:

@@ -93,7 +93,8 @@ class Sweep:
         random = draws.Draws(self.random, self.base)
         repeats = _count("repeats", self.repeats)
         noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in self.axes
-        if repeats > 1 and not random.differs_in_repeats and not noise:
+        seeded = noise or "markov" in (self.base.motor.switching, *self.axes.get("motor.switching", ()))
+        if repeats > 1 and not random.differs_in_repeats and not seeded:
             problem = "would be the same run again and again: nothing is random in a repeat"
             raise SceneError("repeats", repeats, problem, ["random"])
         size = repeats * random.count * int(np.prod([len(values) for values in self.axes.values()], dtype=float))
