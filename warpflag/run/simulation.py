@@ -36,8 +36,7 @@ _SECONDS_PER_REPLAY = 0.2
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
 # Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
 _KEPT_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
-_KEPT_FORMS = ("form", "before", "changed")
-_KEPT_CHART = ("flagellum_spin", "motor_angle", "body_angle")
+_KEPT_FORMS, _KEPT_CHART = ("form", "before", "changed"), ("flagellum_spin", "motor_angle", "body_angle")
 
 
 class Simulation:
