@@ -31,7 +31,12 @@ SWITCHES = {
     "short": {"numerics.pair_precision": "float32"},
     "hook": {"hook.stiffness": 0.65},
     "free": {"body.enabled": False, "flagella.count": 1},
-    "motor law": {"motor.law": "torque_speed", "polymorphs.enabled": True},
+    "motor law": {
+        "motor.law": "torque_speed",
+        "polymorphs.enabled": True,
+        "hook.stiffness": 0.65,
+        "hook.stiffening_torque": 0.5,
+    },
     "body flow": {"hydrodynamics.body_flow": True},
     "unequal": {"hydrodynamics.mode": "consistent", "flagellum.0.segments": 10, "flagellum.1.segments": 20},
     "external": {"external.body_force": (0.0, 0.0, 1.0)},

@@ -1,8 +1,8 @@
 """Polymorphs: every joint of a flagellum is in one of three forms, helices of their own, and flips between them.
 
 The forms are that of the scene's ground state, 0, a target, 1, and one that joints of the target go on to, 2. What
-flips a joint is the moment about the helix axis against the handedness of form 0, as a reversed motor winds a filament up.
-Joints near the root or the tip flip by themselves (nucleation) when their moment along the ground state,
+flips a joint is the moment about the helix axis against the handedness of form 0, as a reversed motor winds a filament
+up. Joints near the root or the tip flip by themselves (nucleation) when their moment along the ground state,
 
     m = -(A (Omega - Omega_p)) . Omega_p/|Omega_p|,     Omega_p: ground state of its form; other sign if of other hand,
 

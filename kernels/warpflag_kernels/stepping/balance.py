@@ -17,8 +17,8 @@ The first step after a start has no energy before it and is not judged.
 
 Where ground states change with time, on the ramps of polymorphs, energy is put in at a pose that stands still: in a
 step -m.change, joint by joint, with the mean m of the moments before and after. Stiff joints follow their ground state,
-so that with the moment before alone they would seem to take in and dissipate k change^2/2, and with that after to give as
-much away. With any moment between the two it differs by at most |dm|.|change|/2, which is allowed, too.
+so that with the moment before alone they would seem to take in and dissipate k change^2/2, and with that after to give
+as much away. With any moment between the two it differs by at most |dm|.|change|/2, which is allowed, too.
 """
 
 import functools
