@@ -169,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
 
     for command in (render, export):
         command.add_argument(
-            "--color", metavar="BY", help="flagellum (default), phase_difference, curvature or steric_force"
+            "--color", metavar="BY", help="flagellum (default), phase_difference, curvature, steric_force or form"
         )
         command.add_argument("--follow", action="store_true", help="the camera goes with the cell")
         command.add_argument("--fps", type=float, help="pictures per second of the film (default: 50)")

@@ -4,6 +4,7 @@ Units um, pN, s, rad. Every entry but the parameters and checksums is a group of
 
     /particles/flagella/position   [frame, node, 3]: lab axes [um], flagellum after flagellum, r_0 to r_N each
     /particles/flagella/e1         [frame, node, 3]: director e1 of motor tripod and segments, same order
+    /particles/flagella/form       [frame, node]: form of the joint at a node, 0: ground state; only with polymorphs
     /cell/motor_angle              [frame, flagellum]: tripod about m relative to the body, accumulated [rad]
     /cell/body_position            [frame, 3]: centre of the body [um]
     /cell/body_orientation         [frame, 4]: quaternion (x, y, z, w) from body to lab axes
@@ -41,6 +42,7 @@ __all__ = [
     "CHECKSUMS",
     "E1",
     "ENTRIES",
+    "FORM",
     "MOTOR_ANGLE",
     "PARAMETERS",
     "POSITION",
@@ -59,6 +61,7 @@ __all__ = [
 RECORD_NAME = "run.h5"
 POSITION = "particles/flagella/position"
 E1 = "particles/flagella/e1"
+FORM = "particles/flagella/form"
 MOTOR_ANGLE = "cell/motor_angle"
 BODY_POSITION = "cell/body_position"
 BODY_ORIENTATION = "cell/body_orientation"
@@ -101,6 +104,8 @@ class Frame:
         body_position: centre of the body [um], shape [3].
         body_orientation: quaternion (x, y, z, w) from body to lab axes, shape [4].
         observables: by name, a number or an array of shape [flagellum_count] each.
+        forms: of the joints at the nodes, 0: the ground state, 1: the target, 2: the second form; 0 at the ends, which
+            have none; shape [node_count]. None without polymorphs.
     """
 
     time: float
@@ -111,6 +116,7 @@ class Frame:
     body_position: NDArray[np.floating]
     body_orientation: NDArray[np.floating]
     observables: dict[str, float | NDArray[np.floating]] = field(default_factory=dict)
+    forms: NDArray[np.integer] | None = None
 
 
 def dataset_path(name: str) -> str:

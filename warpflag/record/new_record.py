@@ -14,6 +14,7 @@ from warpflag.record.layout import (
     BODY_POSITION,
     CHECKSUMS,
     E1,
+    FORM,
     MOTOR_ANGLE,
     POSITION,
     UNITS,
@@ -31,6 +32,7 @@ FORMAT = ("v108", "v108")
 while it is written, and one whose writer was killed can't be opened again."""
 
 _CHUNK_BYTES = 1 << 20
+_WHOLE = {"step": np.int64, FORM: np.int8}  # types of whole numbers by entry
 _NUMBERS = itertools.count()
 _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
@@ -48,7 +50,8 @@ def values_of(frame: Frame) -> dict[str, Any]:
         "time": frame.time,
         **{f"observables/{name}": value for name, value in frame.observables.items()},
     }
-    return {"step": np.int64(frame.step), **{name: np.array(v, dtype=np.float64) for name, v in values.items()}}
+    found = {"step": np.int64(frame.step), **{name: np.array(v, dtype=np.float64) for name, v in values.items()}}
+    return found if frame.forms is None else {**found, FORM: np.array(frame.forms, dtype=np.int8)}
 
 
 def first_image(values: Mapping[str, Any], parameters: Mapping[str, Any]) -> bytes:
@@ -92,7 +95,7 @@ def _empty_image(shapes: tuple[tuple[str, tuple[int, ...]], ...], version: str) 
         box = file.create_group("particles/flagella/box")
         box.attrs["dimension"] = np.int32(3)
         box.attrs["boundary"] = np.array([_text("none")] * 3)
-        empty = {name: np.zeros(shape, dtype=np.int64 if name == "step" else np.float64) for name, shape in shapes}
+        empty = {name: np.zeros(shape, dtype=_WHOLE.get(name, np.float64)) for name, shape in shapes}
         # The shared datasets first, under the entry that every record has.
         for name in ("step", "time", *(name for name in empty if name not in ("step", "time"))):
             _add_dataset(file, name, empty[name])

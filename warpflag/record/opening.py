@@ -19,6 +19,7 @@ from warpflag.record.layout import (
     CHECKSUMS,
     E1,
     ENTRIES,
+    FORM,
     MOTOR_ANGLE,
     PARAMETERS,
     POSITION,
@@ -105,7 +106,8 @@ def _checked(path: Path, file: Any) -> Contents:
             raise RecordError(f"{path}: not a record of warpflag, it has no /{missing[0]}")
         frames = len(file[dataset_path("step")])
         parameters = _parameters(path, file["parameters"])
-        entries = ["step", "time", *ENTRIES, *(f"observables/{name}" for name in file.get("observables", ()))]
+        forms = [FORM] if FORM in file else []
+        entries = ["step", "time", *ENTRIES, *forms, *(f"observables/{name}" for name in file.get("observables", ()))]
         shapes = _shapes(path, file, entries, frames, parameters["first_node"])
         sums: dict[str, NDArray[np.uint32]] = {}
         if CHECKSUMS in file:
@@ -124,12 +126,12 @@ def _shapes(
     nodes, flagella, size = int(first_node[-1]), len(first_node) - 1, path.stat().st_size
     found = {}
     shapes = {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,), "step": (), "time": ()}
-    shapes |= {BODY_POSITION: (3,), BODY_ORIENTATION: (4,)}
+    shapes |= {BODY_POSITION: (3,), BODY_ORIENTATION: (4,), FORM: (nodes,)}
     for name in entries:
         dataset = file[dataset_path(name)]
         found[name] = tuple(dataset.shape[1:])
         allowed = [shapes[name]] if name in shapes else [(), (flagella,)]
-        fits = found[name] in allowed and dataset.dtype.kind == ("i" if name == "step" else "f")
+        fits = found[name] in allowed and dataset.dtype.kind == ("i" if name in ("step", FORM) else "f")
         if not fits or len(dataset) < frames or frames * dataset.dtype.itemsize > size:
             problem = f"/{dataset_path(name)} has the shape {dataset.shape}, type {dataset.dtype}"
             raise RecordError(f"{path}: is damaged: {problem} beside {frames} frames, {nodes} nodes")

@@ -20,6 +20,7 @@ from warpflag.record.layout import (
     BODY_POSITION,
     E1,
     ENTRIES,
+    FORM,
     MOTOR_ANGLE,
     POSITION,
     RECORD_NAME,
@@ -160,6 +161,11 @@ class Record:
         return self._frames(E1)
 
     @property
+    def forms(self) -> FrameArray | None:
+        """Forms of the joints, as in `Frame`, shape [frame_count, node_count]; None for a run without polymorphs."""
+        return self._frames(FORM) if FORM in self.entries else None
+
+    @property
     def motor_angle(self) -> NDArray[np.float64]:
         """Accumulated angles of the tripods relative to the body [rad], shape [frame_count, flagellum_count]."""
         return self._frames(MOTOR_ANGLE)[:]
@@ -241,6 +247,7 @@ class Record:
         if not -self.frame_count <= index < self.frame_count:
             raise RecordError(f"{self.path}: has no frame {index}, only {self.frame_count} frames")
         at = {name: self._frames(name)[index] for name in ("step", "time", *ENTRIES)}
+        forms = self.forms
         return Frame(
             time=float(at["time"]),
             step=int(at["step"]),
@@ -250,4 +257,5 @@ class Record:
             body_position=at[BODY_POSITION],
             body_orientation=at[BODY_ORIENTATION],
             observables={name: self._frames(f"observables/{name}")[index] for name in self._observable_names},
+            forms=None if forms is None else forms[index].astype(np.int8),
         )

@@ -36,8 +36,7 @@ class _Block:
     Attributes:
         counts: how many of them each cell has, shape [cell_count].
         motor_torque: of the motors [pN um], shape [m, flagellum_count]; empty where torques are constant.
-        target_share: share of each flagellum's joints in the target form, shape [m, flagellum_count]; empty without
-            polymorphs.
+        forms: of the joints at the nodes, shape [m, node_count]; empty without polymorphs.
         before: the motion at the frame before each, entry [m] of every array.
     """
 
@@ -53,7 +52,7 @@ class _Block:
     elastic_energy: np.ndarray
     steric_force: np.ndarray
     motor_torque: np.ndarray
-    target_share: np.ndarray
+    forms: np.ndarray
     before: Mapping[str, np.ndarray]
 
 
@@ -142,7 +141,7 @@ class Frames:
         counts = np.ones(len(now.time), dtype=np.int64)
         torque = motor_torques(self._system)[None]  # of the present state, which was evaluated last
         forms = self._system.state.data.forms.form.numpy()[None] if self._polymorphs else np.zeros((1, 0))
-        further = {"motor_torque": torque, "target_share": self._shares(forms), "before": before}
+        further = {"motor_torque": torque, "forms": forms, "before": before}
         block = _Block(counts=counts, steric_force=now.steric_force[None], **further, **arrays)
         return self._measured(block)
 
@@ -219,7 +218,7 @@ class Frames:
         block = _Block(
             counts=counts,
             motor_torque=torque,
-            target_share=self._shares(read(d.form, elements) if self._polymorphs else np.zeros((m, 0))),
+            forms=read(d.form, elements).copy() if self._polymorphs else np.zeros((m, 0)),
             step=read(d.step, cells).copy(),
             positions=read(d.position, elements).astype(np.float64) + centres[:, self._cell_of_node],
             directors=read(d.director, elements).astype(np.float64),
@@ -234,13 +233,6 @@ class Frames:
     def _sums(self, values: np.ndarray) -> np.ndarray:
         """The sum over the nodes of each cell, shape [m, cell_count, ...]; independent of other cells to the bit."""
         return np.add.reduceat(values.astype(np.float64), self._first_node_of_cell, axis=1)
-
-    def _shares(self, forms: np.ndarray) -> np.ndarray:
-        """Share of the joints between segments that are in the target form, shape [m, flagellum_count]."""
-        if not self._polymorphs:
-            return np.zeros((len(forms), 0))
-        joints = np.diff(self._first_node) - 2
-        return np.add.reduceat(forms.astype(np.float64), self._first_node[:-1], axis=1) / joints
 
     def _flagella(self, cell: int) -> slice:
         return slice(int(self._first_flagellum[cell]), int(self._first_flagellum[cell + 1]))
@@ -266,6 +258,7 @@ class Frames:
                     body_position=block.body_position[i, c],
                     body_orientation=block.body_orientation[i, c],
                     observables=observables,
+                    forms=block.forms[i, nodes] if self._polymorphs else None,
                 )
         for c in np.flatnonzero(block.counts).tolist():
             at, flagella = block.counts[c] - 1, self._flagella(c)
@@ -300,7 +293,10 @@ class Frames:
             pairs = zip(block.time[m, cells], flagella, strict=True)
             measured["motor_drive"] = np.array([[np.interp(t, *self._drives[k]) for k in own] for t, own in pairs])
         if self._polymorphs:
-            measured["target_form_share"] = block.target_share[row, flagella]
+            changed = (block.forms[row, nodes] > 0).astype(np.float64)
+            measured["target_form_share"] = np.add.reduceat(changed, first_node[:-1], axis=1) / (
+                np.diff(first_node) - 2
+            )
         before = block.before
         duration = block.time[m, cells] - before["time"][m, cells]
         at_ends = [before["body_position"][m, cells], block.body_position[m, cells]]

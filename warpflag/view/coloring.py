@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from warpflag.base.output import OutputError
 from warpflag.observables.contact import own_spacing
 from warpflag.record import Record
 from warpflag.scene import Scene
@@ -20,22 +21,32 @@ __all__ = [
     "BODY_COLOR",
     "DISPLAY_RADIUS",
     "FLAGELLUM_COLORS",
+    "FORM_COLORS",
     "QUANTITIES",
     "UNDEFINED_COLOR",
     "Coloring",
+    "form_names",
     "linear",
     "map_color",
 ]
 
-QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force")
+QUANTITIES = ("flagellum", "phase_difference", "curvature", "steric_force", "form")
 
 _PRIMVARS = {
     "flagellum": "flagellum",
     "phase_difference": "phaseDifference",
     "curvature": "curvature",
     "steric_force": "stericForce",
+    "form": "form",
 }
-_LABELS = {"phase_difference": "phase difference", "curvature": "curvature 1/µm", "steric_force": "steric force pN"}
+_LABELS = {
+    "phase_difference": "phase difference",
+    "curvature": "curvature 1/µm",
+    "steric_force": "steric force pN",
+    "form": "form",
+}
+FORM_COLORS = ("#0072b2", "#e69f00", "#d55e00")
+"""Of the ground state, the target and the second form."""
 
 # The first seven are Okabe & Ito's, told apart by colour-blind eyes too; the rest are far from them and each other.
 FLAGELLUM_COLORS = (
@@ -49,6 +60,13 @@ UNDEFINED_COLOR = "#9a9a9a"
 BODY_COLOR = "#dfcfae"
 DISPLAY_RADIUS = 0.05
 """Of the flagella in pictures, pages and meshes, where they are thinner [um]: true to scale they would vanish."""
+
+
+def form_names(scene: Scene) -> list[str]:
+    """Names of the forms that a scene with polymorphs has, in the order of their numbers."""
+    forms = scene.polymorphs
+    names = ["ground state", forms.target, *([] if forms.second == "none" else [forms.second])]
+    return [name.replace("_", "-") for name in names]
 
 
 def linear(color: str) -> NDArray[np.float32]:
@@ -79,7 +97,7 @@ class Coloring:
     Attributes:
         quantity: one of `QUANTITIES`: flagellum, a colour each; phase_difference, `nearest_phase_difference` from 0 to
             1; curvature, `curvature` from 0 to twice the intrinsic one; steric_force, `contact_load` from 0 to 8 F_0,
-            a firm contact of two bundled flagella.
+            a firm contact of two bundled flagella; form, that of the joint at a node, a colour each.
         record: the run.
         scene: of the record.
     """
@@ -99,6 +117,11 @@ class Coloring:
         return _LABELS.get(self.quantity, "")
 
     @property
+    def names(self) -> list[str]:
+        """What each of the colours means, of a quantity that has a colour each; empty of others, and of flagella."""
+        return form_names(self.scene) if self.quantity == "form" else []
+
+    @property
     def changes(self) -> bool:
         """Whether the colours change from frame to frame."""
         return self.quantity != "flagellum"
@@ -113,6 +136,7 @@ class Coloring:
                 "phase_difference": 1.0,
                 "curvature": 2.0 * bend or 1.0,
                 "steric_force": 8.0 * self.scene.steric.strength or 1.0,
+                "form": len(FORM_COLORS) - 1,
             }[self.quantity]
         )
 
@@ -130,6 +154,8 @@ class Coloring:
             return curvature(positions, first_node)
         if self.quantity == "phase_difference":
             return nearest_phase_difference(positions, self.record.directors[frames], first_node)
+        if self.quantity == "form":
+            return self._forms(frames)
         steric = self.scene.steric
         diameter = 4.0 * self.record.filament_radius if steric.diameter is None else steric.diameter
         strength = steric.strength if steric.enabled else 0.0
@@ -137,11 +163,21 @@ class Coloring:
         own = np.array([own_spacing(diameter, h) for h in lengths]) if steric.self_contact else None
         return contact_load(positions, first_node, strength, diameter, own)
 
+    def _forms(self, frames: slice) -> NDArray[np.floating]:
+        """Ends of a flagellum, which have no joint, look like their neighbours."""
+        if self.record.forms is None:
+            raise OutputError(f"color form: {self.record.path} has none; its scene has polymorphs.enabled = false")
+        values, first_node = self.record.forms[frames].astype(float), self.record.first_node
+        values[:, first_node[:-1]] = values[:, first_node[:-1] + 1]
+        values[:, first_node[1:] - 1] = values[:, first_node[1:] - 2]
+        return values
+
     def colors(self, values: ArrayLike) -> NDArray[np.float32]:
         """Linear RGB of values, shape [..., 3]; grey where they are undefined."""
         values = np.asarray(values, float)
-        if self.quantity == "flagellum":
-            table = np.stack([linear(color) for color in FLAGELLUM_COLORS])
+        if self.quantity in ("flagellum", "form"):
+            shown = FLAGELLUM_COLORS if self.quantity == "flagellum" else FORM_COLORS
+            table = np.stack([linear(color) for color in shown])
             return table[values.astype(int) % len(table)]
         # By a table of 256: decoding each of millions of values would take longer than all the rest.
         table = np.vstack([_decoded(map_color(np.linspace(0.0, 1.0, 256)) / 255.0), linear(UNDEFINED_COLOR)])

@@ -11,6 +11,7 @@ import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from warpflag.base.output import OutputError, whole
 from warpflag.observables.arrays import Array
 from warpflag.record import Record, RecordError
 from warpflag.scene import Scene, loads
-from warpflag.view.coloring import FLAGELLUM_COLORS, map_color
+from warpflag.view.coloring import FLAGELLUM_COLORS, FORM_COLORS, form_names, map_color
 from warpflag.view.curves import Curve, curves
 from warpflag.view.labels import labels_of
 
@@ -65,12 +66,14 @@ class Run:
         scene: the scene of the record.
         times: of the frames [ms], shape [frame_count].
         curves: the observables by name.
+        forms: of the joints of every flagellum, shapes [frame_count, joint_count]; empty without polymorphs.
     """
 
     label: str
     scene: Scene
     times: Array
     curves: dict[str, Curve]
+    forms: tuple[Array, ...] = ()
 
 
 def read(directory: str | Path, label: str = "") -> Run:
@@ -87,7 +90,11 @@ def read(directory: str | Path, label: str = "") -> Run:
         if record.frame_count == 0:
             raise RecordError(f"{record.path}: holds no frames to draw")
         found = {curve.name: curve for curve in curves(record)}
-        return Run(label, loads(record.scene_text), 1e3 * record.times, found)
+        forms: tuple[Array, ...] = ()
+        if record.forms is not None:
+            joints = [slice(first + 1, end - 1) for first, end in pairwise(record.first_node.tolist())]
+            forms = tuple(record.forms[:, own] for own in joints)
+        return Run(label, loads(record.scene_text), 1e3 * record.times, found, forms)
 
 
 def dashboard(run: Run | str | Path) -> Figure:
@@ -100,13 +107,16 @@ def dashboard(run: Run | str | Path) -> Figure:
         RecordError: no record, or one without frames.
     """
     run = run if isinstance(run, Run) else read(run)
-    rows = -(-len(run.curves) // 2)
+    count = len(run.curves) + bool(run.forms)
+    rows = -(-count // 2)
     with styled() as figure_of:
         figure = figure_of(figsize=(TWO_COLUMNS, 0.5 + 1.25 * rows), layout="constrained")
         panels = [*figure.subplots(rows, 2, sharex=True, squeeze=False).T.ravel()]
-        if len(run.curves) < len(panels):
+        if count < len(panels):
             panels.pop(rows).remove()  # the upper right corner stays free, so that both columns end below
-        for axes, curve in zip(panels, run.curves.values(), strict=True):
+        if run.forms:
+            _draw_forms(panels[-1], run)
+        for axes, curve in zip(panels[: len(run.curves)], run.curves.values(), strict=True):
             many = curve.values.shape[1] > 1
             for k, line in enumerate(curve.values.T):
                 color = FLAGELLUM_COLORS[k % len(FLAGELLUM_COLORS)] if many else COLORS[0]
@@ -117,6 +127,28 @@ def dashboard(run: Run | str | Path) -> Figure:
         count = len(run.scene.resolved_flagella())
         figure.suptitle(f"{run.label or run.scene.name}: {count} {'flagella' if count > 1 else 'flagellum'}")
     return figure
+
+
+def _draw_forms(axes: Any, run: Run) -> None:
+    """Forms along every flagellum over time, one flagellum above the other."""
+    from matplotlib.colors import ListedColormap
+
+    names = form_names(run.scene)
+    colors = FORM_COLORS[: len(names)]
+    specs = run.scene.resolved_flagella()
+    base = 0.0
+    for k, (spec, forms) in enumerate(zip(specs, run.forms, strict=True)):
+        h = spec.segment_length
+        edges = np.concatenate([run.times[:1], (run.times[1:] + run.times[:-1]) / 2, run.times[-1:]])
+        along = base + h * (0.5 + np.arange(forms.shape[1] + 1))
+        axes.pcolormesh(edges, along, forms.T, cmap=ListedColormap(colors), vmin=-0.5, vmax=len(names) - 0.5)
+        base += spec.length
+        if k + 1 < len(specs):
+            axes.axhline(base, color="w", linewidth=1.0)
+    axes.set_ylim(0.0, 1.25 * base)  # room for the legend
+    axes.set_title("forms, contour from the motor (µm)" + (", flagella stacked" if len(specs) > 1 else ""), loc="left")
+    patches = [axes.plot([], [], "s", color=color, label=name)[0] for name, color in zip(names, colors, strict=True)]
+    axes.legend(handles=patches, loc="upper right", ncols=len(names), frameon=True, borderpad=0.2)
 
 
 def comparison(runs: Sequence[Run | str | Path]) -> Figure:

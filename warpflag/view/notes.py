@@ -5,6 +5,7 @@ Without Pillow (extra `render`) pictures are drawn with nothing on them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import as_file, files
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpflag.view.coloring import map_color
+from warpflag.view.coloring import FORM_COLORS, map_color
 
 __all__ = ["Pen", "can_write"]
 
@@ -73,19 +74,28 @@ class Pen:
         self._text(f"{length:g} µm", place, anchor="ms")
         return length
 
-    def write_legend(self, factor: float, label: str, highest: float) -> None:
+    def write_legend(self, factor: float, label: str, highest: float, names: Sequence[str] = ()) -> None:
         """Writes into the lower left corner how much flagella are thickened, and what their colours mean.
 
         Args:
             factor: how many times thicker than the record's they are drawn.
             label: of the quantity that colours them, with its unit; empty where colours only tell them apart.
             highest: value of the last colour; the first one's is 0.
+            names: of the forms, for a quantity that has a colour each.
         """
         left, row = 1.4 * self._letter, self._height - 1.6 * self._letter
         if factor > 1.05:
             self._text(f"flagella drawn {_short(factor)}x thicker", (left, row), 0.75, FAINT)
             row -= 2.2 * self._letter
-        if label:
+        for name, color in reversed(list(zip(names, FORM_COLORS, strict=False))):
+            rgb = np.frombuffer(bytes.fromhex(color[1:]), dtype=np.uint8)
+            self._paste(
+                np.tile(rgb, (round(0.7 * self._letter), round(1.4 * self._letter), 1)),
+                (round(left), round(row - 0.7 * self._letter)),
+            )
+            self._text(name, (left + 1.9 * self._letter, row), 0.75)
+            row -= 1.4 * self._letter
+        if label and not names:
             start = left + 1.2 * self._letter
             self._text("0", (left, row), 0.75)
             width, height = round(9 * self._letter), round(0.7 * self._letter)

@@ -82,7 +82,8 @@ class Renderer:
             if size[0] > _LEGEND_ROOM * letter:
                 facts = self.film.facts
                 factor = radius / self.film.thinnest()
-                pen.write_legend(factor, facts.get("colorLabel", ""), facts.get("colorHighest", 0.0))
+                names = [name for name in facts.get("colorNames", "").split(", ") if name]
+                pen.write_legend(factor, facts.get("colorLabel", ""), facts.get("colorHighest", 0.0), names)
         return pen.picture
 
     def sheet(self, codes: Sequence[float], progress: Progress) -> NDArray[np.uint8]:

@@ -193,7 +193,8 @@ class CellView {
   setColor(name) {
     const coloring = this.shown.colorings[name];
     this.shares = coloring ? unpacked(coloring.shares, Uint8Array) : null;
-    const colors = coloring ? [...this.shown.map, this.shown.undefinedColor] : this.shown.flagellumColors;
+    const scale = [...this.shown.map, this.shown.undefinedColor];
+    const colors = coloring ? coloring.colors || scale : this.shown.flagellumColors;
     this.table = colors.map((color) => new THREE.Color(color));
     this.tubes.forEach((tube) => this.colorTube(tube));
     this.ask();

@@ -14,6 +14,7 @@ from warpflag.view.coloring import (
     BODY_COLOR,
     DISPLAY_RADIUS,
     FLAGELLUM_COLORS,
+    FORM_COLORS,
     QUANTITIES,
     UNDEFINED_COLOR,
     Coloring,
@@ -114,12 +115,19 @@ def _view(record: Record, positions: Any, centres: Any, path: Any) -> dict[str, 
 
 
 def _colorings(record: Record, scene: Any, positions: Any, frames: slice) -> dict[str, Any]:
-    """By quantity: its label, the value of the last colour, and the share of it at every node, 0 to 254."""
+    """By quantity: its label, the value of the last colour, and the share of it at every node, 0 to 254.
+
+    Of forms their names and colours, and the number of that of every node.
+    """
     found = {}
     for name in QUANTITIES[1:]:
-        if name == "phase_difference" and len(record.first_node) == 2:
+        if (name == "phase_difference" and len(record.first_node) == 2) or (name == "form" and record.forms is None):
             continue
         coloring = Coloring(name, record, scene)
+        if coloring.names:
+            own = {"label": coloring.label, "names": coloring.names, "colors": FORM_COLORS[: len(coloring.names)]}
+            found[name] = {**own, "shares": _packed(coloring.values(positions, frames), "u1")}
+            continue
         values = coloring.values(positions, frames) / coloring.highest
         shares = np.where(np.isnan(values), _UNDEFINED, np.clip((_UNDEFINED - 1) * values + 0.5, 0.0, _UNDEFINED - 1))
         found[name] = {"label": coloring.label, "highest": coloring.highest, "shares": _packed(shares, "u1")}

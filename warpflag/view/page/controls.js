@@ -64,10 +64,20 @@ function drawScale(pixels) {
 
 function chooseColor(name) {
   const coloring = shown.colorings[name];
-  part("color-label").textContent = coloring ? coloring.label : "";
-  part("color-bar").hidden = !coloring;
-  part("color-bar").style.display = coloring ? "" : "none";
-  if (coloring) {
+  part("color-label").textContent = coloring && !coloring.names ? coloring.label : "";
+  const scaled = coloring && !coloring.names;
+  part("color-bar").hidden = !scaled;
+  part("color-bar").style.display = scaled ? "" : "none";
+  if (coloring && coloring.names) {
+    coloring.names.forEach((name, i) => {
+      const row = document.createElement("span"), patch = document.createElement("i");
+      patch.style.background = coloring.colors[i];
+      row.className = "form";
+      row.append(patch, name);
+      part("color-label").append(row);
+    });
+  }
+  if (scaled) {
     part("color-map").style.background = `linear-gradient(to right, ${shown.map.filter((_, i) => i % 16 === 0).join(",")})`;
     part("color-highest").textContent = short(Number(coloring.highest.toPrecision(2)));
   }

@@ -49,7 +49,7 @@ class Shot:
     """How a record is filmed.
 
     Attributes:
-        color_by: flagellum, phase_difference, curvature or steric_force.
+        color_by: flagellum, phase_difference, curvature, steric_force or form.
         follow: whether the camera goes with the cell.
         frames_per_second: of the film.
         slow_down: how many times slower than the cell the film plays; None: a frame of it per frame of the record.
@@ -245,6 +245,7 @@ class _Film:
             "colorBy": coloring.quantity,
             "colorLabel": coloring.label,
             "colorHighest": coloring.highest,
+            "colorNames": ", ".join(coloring.names),
         }
 
     def _followed(self) -> Any:
