@@ -10,10 +10,13 @@ Takes the records of the two runs and simulates the third itself, at several tor
 import argparse
 from pathlib import Path
 
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 
 from warpflag import Record, Simulation
 from warpflag.scene import load, with_values
+from warpflag.view.coloring import FORM_COLORS
 
 HERE = Path(__file__).parent
 SMOOTHING = 0.05  # s, longer than a turn of the body
@@ -26,16 +29,7 @@ options = options.parse_args()
 options.output.mkdir(parents=True, exist_ok=True)
 
 
-def pyplot():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot
-
-    return matplotlib.pyplot
-
-
-plt = pyplot()
+matplotlib.use("Agg")
 
 
 def save(figure, name: str) -> None:
@@ -75,15 +69,21 @@ def run_and_tumble() -> None:
 
 
 def reversal() -> None:
-    """Share of the joints in the target form, and the motor's sense."""
+    """Forms along the filament over time, and the motor's sense."""
     with Record(options.runs / "reversal") as record:
-        t, share = 1e3 * record.times[:], record.observables["target_form_share"][:, 0]
-        drive = record.observables["motor_drive"][:, 0]
-    figure, axes = plt.subplots(figsize=(5, 2.8))
-    axes.fill_between(t, 0, 1, where=drive < 0, color="C3", alpha=0.2, lw=0, label="motor in reverse")
-    axes.plot(t, share, "k", label="joints in semicoiled form")
-    axes.set(xlabel="ms", ylabel="share", xlim=(0, t[-1]), ylim=(0, 1.02))
-    axes.legend(frameon=False, fontsize=8, loc="upper right")
+        forms = record.forms
+        assert forms is not None
+        t, along = 1e3 * record.times[:], 6.0 / 30 * np.arange(1, 30)
+        drive, joints = record.observables["motor_drive"][:, 0], forms[:, 1:-1]
+    figure, (above, axes) = plt.subplots(2, sharex=True, figsize=(5, 3.2), height_ratios=[1, 4])
+    above.fill_between(t, 0, drive, color="C3", lw=0)
+    above.set(ylabel="drive", ylim=(-1.2, 1.2))
+    colors = matplotlib.colors.ListedColormap(FORM_COLORS[:2])
+    axes.pcolormesh(t, along, joints.T, cmap=colors, vmin=-0.5, vmax=1.5, shading="nearest")
+    for name, color in zip(("normal", "semicoiled"), FORM_COLORS, strict=False):
+        axes.plot([], [], "s", color=color, label=name)
+    axes.set(xlabel="ms", ylabel="contour from the motor, µm", xlim=(0, t[-1]), ylim=(0, 7.2))
+    axes.legend(fontsize=8, frameon=False, loc="upper right", ncols=2)
     save(figure, "reversal")
 
 

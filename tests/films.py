@@ -79,10 +79,18 @@ def made_record(
                     "bundle_length": 0.1 * i,
                     "motor_rate": np.full(len(motor_angle), np.nan if i == 0 else i),
                 },
+                forms=made_forms(first_node, i),
             )
         )
     recorder.close()
     return Record(directory)
+
+
+def made_forms(first_node: np.ndarray, frame: int) -> np.ndarray:
+    """A front that runs from the root of every flagellum, two joints a frame."""
+    forms = np.concatenate([np.arange(count) <= 2 * frame for count in np.diff(first_node)]).astype(int)
+    forms[[*first_node[:-1], *(first_node[1:] - 1)]] = 0
+    return forms
 
 
 def _quaternion_of(turn: np.ndarray) -> np.ndarray:

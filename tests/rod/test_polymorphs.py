@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from tests.helpers import attachment, cell, ground_state_frames, placed
+from tests.runs import executed
 from warpflag.model import switching
 from warpflag.observables import power_balance
+from warpflag.record import Record
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import Scene, with_values
 
@@ -211,12 +213,20 @@ def test_a_stopped_run_goes_on_with_the_same_bits(device):
     assert np.array_equal(forms(second), forms(whole))
 
 
-def test_frames_hold_the_share_in_the_target_form(device):
+def test_frames_and_record_hold_the_forms_and_the_share_in_the_target_form(device, tmp_path):
     scene = cell({**HELD, "motor.torque": -3.4, "flagella.length": 3.0, "duration": 1e-3, "frames": 4})
     frames = list(Simulation(scene, device=device).frames(1e-3))
     shares = np.array([frame.observables["target_form_share"] for frame in frames])[:, 0]
     assert shares[0] == 0.0 and shares[-1] > 0.1
     assert (np.diff(shares) >= 0).all()
+    forms_of = np.array([frame.forms for frame in frames])
+    assert np.allclose(forms_of.sum(axis=1) / 14, shares)
+    assert set(np.diff(forms_of[-1, 1:].astype(int))) <= {0, -1}  # a front from the root
+    with Record(executed(scene, tmp_path / "run")) as record:
+        assert np.array_equal(record.forms[:], forms_of)
+        assert np.array_equal(record.frame(-1).forms, forms_of[-1])
+    with Record(executed(with_values(scene, {"polymorphs.enabled": False}), tmp_path / "plain")) as record:
+        assert record.forms is None and record.frame(0).forms is None
 
 
 def test_off_there_is_none_of_it(device):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.films import made_record
+from tests.films import THREE, made_record
 from tests.runs import executed, small
 from warpflag.model.geometry import ground_state
 from warpflag.observables import local_phase_difference, phase_difference, segment_tangents
 from warpflag.record import Record
+from warpflag.view.coloring import FORM_COLORS, Coloring, linear
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
 
 STRENGTH, DIAMETER = 0.8, 0.04
@@ -137,3 +138,18 @@ def test_phase_difference_is_undefined_without_a_partner():
     theta = nearest_phase_difference(longer, directors, np.array([0, 3, 7]))
     assert np.isfinite(theta[0, :6]).all() and np.isnan(theta[0, 6])
     assert np.isnan(nearest_phase_difference(positions[:, :3], directors[:, :3], np.array([0, 3]))).all()
+
+
+def test_forms_have_a_colour_each_and_ends_that_of_their_neighbour(tmp_path):
+    record = made_record(tmp_path, 4)
+    coloring = Coloring("form", record, THREE)
+    values = coloring.values(record.positions[:], slice(0, 4))
+    assert coloring.names == ["ground state", "semicoiled"]
+    for first in record.first_node[:-1]:
+        assert values[:, first : first + 8].tolist() == [
+            [i >= 1] * 2 + [n <= 2 * i for n in range(2, 8)] for i in range(4)
+        ]
+    colors = coloring.colors(values)
+    assert np.array_equal(
+        np.unique(colors.reshape(-1, 3), axis=0), np.unique([linear(c) for c in FORM_COLORS[:2]], axis=0)
+    )
