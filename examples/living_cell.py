@@ -10,8 +10,6 @@ Takes the records of the two runs and simulates the third itself, at several tor
 import argparse
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 
 from warpflag import Record, Simulation
@@ -29,7 +27,16 @@ options = options.parse_args()
 options.output.mkdir(parents=True, exist_ok=True)
 
 
-matplotlib.use("Agg")
+def pyplot():
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot
+
+    return matplotlib.pyplot
+
+
+plt = pyplot()
 
 
 def save(figure, name: str) -> None:
@@ -78,8 +85,7 @@ def reversal() -> None:
     figure, (above, axes) = plt.subplots(2, sharex=True, figsize=(5, 3.2), height_ratios=[1, 4])
     above.fill_between(t, 0, drive, color="C3", lw=0)
     above.set(ylabel="drive", ylim=(-1.2, 1.2))
-    colors = matplotlib.colors.ListedColormap(FORM_COLORS[:2])
-    axes.pcolormesh(t, along, joints.T, cmap=colors, vmin=-0.5, vmax=1.5, shading="nearest")
+    axes.contourf(t, along, joints.T, levels=[-0.5, 0.5, 1.5], colors=FORM_COLORS[:2])
     for name, color in zip(("normal", "semicoiled"), FORM_COLORS, strict=False):
         axes.plot([], [], "s", color=color, label=name)
     axes.set(xlabel="ms", ylabel="contour from the motor, µm", xlim=(0, t[-1]), ylim=(0, 7.2))

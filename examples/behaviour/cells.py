@@ -67,26 +67,32 @@ for name, unit in (
     median = np.median(own) if len(own) else np.nan
     print(f"{name:20s} {own.mean():8.3g} +- {error:<8.2g} median {median:<8.3g} {len(own):4d} values  {unit}")
 
-import matplotlib  # noqa: E402
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+def draw() -> None:
+    """Histograms of tumble angles, tumble durations and speeds."""
+    import matplotlib
 
-figure, panels = plt.subplots(1, 3, figsize=(9, 2.8))
-for axes, name, bins, label, published in zip(
-    panels,
-    ("angle", "tumble", "speed"),
-    (np.arange(0, 181, 15), np.arange(0, 1.01, 0.1), 12),
-    ("tumble angle, degrees", "tumble, s", "speed in runs, µm/s"),
-    ((68, "Berg & Brown 1972"), (0.14, "Berg & Brown 1972"), (29, "Darnton et al. 2007")),
-    strict=True,
-):
-    own = values[name][np.isfinite(values[name])]
-    axes.hist(own, bins=bins, color="C0", alpha=0.7)
-    axes.axvline(own.mean(), color="k", lw=1, label=f"mean {own.mean():.3g}")
-    axes.axvline(published[0], color="C3", ls="--", lw=1, label=f"{published[0]} ({published[1]})")
-    axes.set(xlabel=label)
-    axes.legend(fontsize=7, frameon=False)
-panels[0].set_ylabel("count")
-figure.tight_layout()
-figure.savefig(options.output, dpi=100)
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 3, figsize=(9, 2.8))
+    for axes, name, bins, label, published in zip(
+        panels,
+        ("angle", "tumble", "speed"),
+        (np.arange(0, 181, 15), np.arange(0, 1.01, 0.1), 12),
+        ("tumble angle, degrees", "tumble, s", "speed in runs, µm/s"),
+        ((68, "Berg & Brown 1972"), (0.14, "Berg & Brown 1972"), (29, "Darnton et al. 2007")),
+        strict=True,
+    ):
+        own = values[name][np.isfinite(values[name])]
+        axes.hist(own, bins=bins, color="C0", alpha=0.7)
+        axes.axvline(own.mean(), color="k", lw=1, label=f"mean {own.mean():.3g}")
+        axes.axvline(published[0], color="C3", ls="--", lw=1, label=f"{published[0]} ({published[1]})")
+        axes.set(xlabel=label)
+        axes.legend(fontsize=7, frameon=False)
+    panels[0].set_ylabel("count")
+    figure.tight_layout()
+    figure.savefig(options.output, dpi=100)
+
+
+draw()

@@ -24,6 +24,7 @@ from warpflag_kernels.implicit import (
     stability,
     step_flow,
 )
+from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
 from warpflag_kernels.stepping import dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
@@ -152,6 +153,7 @@ class ThermalStepper:
             dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
+        hook.follow(model, state, s.chart)
         equilibrium.finish_step(model, state, parts, explicit)
         clock.count_pass(s.control, model.device)
 
