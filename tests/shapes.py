@@ -47,18 +47,24 @@ def joined(*flagella):
     return np.concatenate(flagella), np.cumsum([0, *(len(nodes) for nodes in flagella)])
 
 
+PARTED = 0.48  # um; distance of the flagella of `Zipping` at a front that is not abrupt, beyond the bundle's 0.44
+
+
 class Zipping:
     """Two left-handed helices of 31 nodes that turn at 300 Hz and bundle from the motor on, on a body that swims.
 
     The front starts at 40 % of the contour and moves at 100 contours a second from 1 ms on; before, nothing is bundled.
     All of it in axes turned in the lab. Frames every 0.05 ms to 8 ms.
+
+    split: how fast the second flagellum leaves the first at the front [um of distance per um of contour]; 0: at once, a
+    segment across, which no axis of a turn survives.
     """
 
     helix_rate, motor_rate, body_rate, body_speed = 300.0, 400.0, -60.0, 150.0
     pitch, segments, start, onset, front_speed = -2.14, 30, 0.4, 1e-3, 100.0
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
+    def __init__(self, directory: Path, split: float = 0.0) -> None:
+        self.directory, self.split = directory, split
         self.scene = paper_scene(name="made-up")
         self.times = 5e-5 * np.arange(161)
         first_node = np.array([0, 31, 62])
@@ -70,14 +76,21 @@ class Zipping:
 
     def front(self, times):
         """l_r of the construction, before it is cut to whole nodes; below 0 before the onset."""
+        return np.minimum(self._grown(times), 1.0)
+
+    def _grown(self, times):
+        """The same, and beyond the tips when it has passed them."""
         grown = self.start + self.front_speed * (np.asarray(times) - self.onset)
-        return np.where(np.asarray(times) < self.onset - 1e-9, -1.0, np.minimum(grown, 1.0))
+        return np.where(np.asarray(times) < self.onset - 1e-9, -1.0, grown)
 
     def _frame(self, step: int, time: float, first_node: np.ndarray) -> Frame:
         pitch, phase = abs(self.pitch), 2 * np.pi * self.helix_rate * time
         nodes, directors = helix(31, phase=phase, pitch=pitch)
-        free = np.arange(31) / self.segments > self.front(time) + 1e-9
-        other = nodes + np.where(free[:, None], [2.0, 0.0, 0.0], [0.3, 0.0, 0.0])
+        beyond = 0.2 * np.arange(31) - 6.0 * self._grown(time) - 1e-9
+        apart = np.where(beyond > 0.0, 2.0, 0.3)
+        if self.split:
+            apart = np.clip(PARTED + self.split * beyond, 0.3, 2.0)
+        other = nodes + apart[:, None] * [1.0, 0.0, 0.0]
         turn = rotation([0.3, -0.2, 0.1])
         forward = turn @ [0.0, 0.0, -1.0]
         centre = self.body_speed * time * forward

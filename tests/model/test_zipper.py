@@ -99,7 +99,7 @@ def test_what_does_not_zip_is_refused(change, problem):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return Zipping(tmp_path_factory.mktemp("zipping"))
+    return Zipping(tmp_path_factory.mktemp("zipping"), split=0.6)
 
 
 def test_parameters_are_measured_from_a_record(made):
@@ -109,8 +109,8 @@ def test_parameters_are_measured_from_a_record(made):
     assert found.axial_length == pytest.approx(30 * 0.16864, rel=1e-4)
     assert found.body_speed == pytest.approx(made.body_speed)
     assert found.body_rate == pytest.approx(-made.body_rate)
-    # One flagellum is split at the front: a segment across, which spoils the axes of the turns around it.
-    assert found.phase_velocity == pytest.approx(-made.pitch * made.helix_rate, rel=0.08)
+    # The bend at the front, which moves along one of the two, costs 3.6 %.
+    assert found.phase_velocity == pytest.approx(-made.pitch * made.helix_rate, rel=0.05)
 
 
 def test_zipping_is_found_in_a_record_and_fitted(made):
