@@ -29,7 +29,7 @@ _ROUNDS = 3  # over the flagella at fault: one that yields may come upon another
 _WANTED = 0.9  # distance that a flagellum at fault is given, in diameters of the contact
 _TURNS = 300  # steps of turning
 _LARGEST_STEP = 0.03  # rad
-_LARGEST_TURN = 30.0  # deg; beyond, the scene is refused
+_LARGEST_TURN = 45.0  # deg; beyond, the scene is refused
 _SOFT = 1e-4  # um^2; arms that turn a contact by less than a hundredth of it hardly count
 _MOST = 500  # flagella; in larger crowds those that are on each other are left to the contact force
 
