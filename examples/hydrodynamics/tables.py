@@ -24,7 +24,7 @@ import joint
 ETA = 1e-3
 BEADS = (30, 60, 120, 480)
 GAPS = (0.06, 0.1, 0.2, 0.5)
-MODES = ("none", "all", "consistent")
+MODES = ("none", "as_printed", "all", "consistent")  # of a single helix, within is all and between is none
 
 
 def table(title: str, head: list[str], rows: list[list[str]]) -> str:
@@ -37,7 +37,7 @@ def johnson() -> str:
     """Thrust, torque and drag of a helix (R 1, a 0.04, pitch 10.2, axial length 30.9, eta 1) beside Johnson's."""
     exact = np.array([41.58, 11.93, 87.77])
     rows = []
-    for count in (39, 78, 160, 260):
+    for count in (39, 78, 160, 260, 336):
         for mode in MODES:
             nodes, length = helices.nodes(1.0, 10.2, 30.9, count)
             found = helices.resistance(nodes, length, 0.04, 1.0, mode)
