@@ -145,7 +145,7 @@ def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypa
         (["sweep", "small.toml", "--grid", "motor.torque=1:2"], ["--grid", "from:to:count"]),
         (["sweep", "small.toml", "--share", "2/2"], ["2/2"]),
         (["sweep", "small.toml", "--workers", "0"], ["0", "whole number"]),
-        (["plot", "small.toml", "-o", "x.png", "--y", "steps"], ["small.toml", "is no sweep"]),
+        (["plot", "small.toml", "-o", "x.png", "--x", "steps"], ["small.toml", "is no sweep"]),
         (["swim"], ["swim", "run"]),
     ],
 )

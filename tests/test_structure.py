@@ -21,7 +21,7 @@ ROOMS = {
     "warpflag_kernels": ("base", "rod", "contact", "fluid", "motor", "stepping", "implicit", "thermal"),
     "warpflag": (
         *("base", "scene", "record", "observables", "model", "stepping", "view", "run"),
-        *("sweep_command", "tradeoff_command", "cli", "__main__"),
+        *("sweep_command", "tradeoff_command", "view_command", "cli", "__main__"),
     ),
 }
 

@@ -13,14 +13,13 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from warpflag import __version__, sweep_command, tradeoff_command
+from warpflag import __version__, sweep_command, tradeoff_command, view_command
 from warpflag.base.output import machine_error
 from warpflag.base.streams import explained_cache, protected_streams
 
 if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
     from warpflag.scene import Scene
-    from warpflag.view.usd import Shot
 
 __all__ = ["main"]
 
@@ -111,71 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         said = "replace values: motor.torque=2 flagellum.0.torque=1.5 (check lists all keys)"
         command.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=said)
 
-    plot = commands.add_parser(
-        "plot",
-        help="draw the curves of runs, or the numbers of a sweep",
-        description="Draws what was measured on a run over time, or compares several runs in phase difference, bundle "
-        "length and contact force; needs matplotlib, the extra plot. Runs are labelled by what differs between their "
-        "scenes. The bundle length passes over gaps of 1 um; run.h5 has the plain one. Of a sweep it draws numbers of "
-        "its table against an axis, or maps over two.",
-    )
-    plot.add_argument("directories", nargs="+", metavar="DIR", help="run directory, or the directory of one sweep")
-    plot.add_argument("--x", metavar="COLUMN", help="of a sweep: draw against this column (default: its first axis)")
-    plot.add_argument("--y", nargs="+", default=[], metavar="COLUMN", help="of a sweep: numbers of its table to draw")
-    plot.add_argument("-o", dest="output", metavar="FIG", required=True, help="ends in .png, .pdf, .svg, ...")
-    plot.add_argument(
-        "--as",
-        dest="kind",
-        choices=("dashboard", "comparison", "curves", "map"),
-        help="all curves of one run, or several runs in the same panels (default: by the number of DIR); of a sweep "
-        "curves or a map (default: map of two axes)",
-    )
-    plot.set_defaults(command=_plot)
-
-    render = commands.add_parser(
-        "render",
-        help="draw a run as a picture or a film",
-        description="Draws a run or its movie. Letters, .jpg, .webp and .gif need Pillow, .mp4 ffmpeg (extra render). "
-        "Flagella are drawn with a radius of 0.05 um; the picture says by how much that is too thick.",
-    )
-    render.add_argument("source", metavar="DIR", help="run directory, or a .usdc, .usda or .usdz file")
-    render.add_argument(
-        "-o", dest="output", metavar="FILE", required=True, help="ends in .png, .jpg, .webp, .gif or .mp4"
-    )
-    render.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="pixels (default: 1280x720)")
-    render.add_argument(
-        "--times", type=float, nargs="+", default=[], metavar="MS", help="of a picture [ms]; several make a sheet"
-    )
-    render.add_argument("--snapshots", type=int, metavar="N", help="a sheet of N pictures from first to last")
-    render.add_argument("--radius", type=float, default=0.05, metavar="UM", help="least radius of flagella [um]")
-    render.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
-    render.add_argument("--quiet", action="store_true", help="print errors only")
-    render.set_defaults(command=_render)
-
-    export = commands.add_parser(
-        "export", help="write a record in another format", description="Writes the record of a run in another format."
-    )
-    export.add_argument("directories", nargs="+", metavar="DIR", help="run directory; several make one USD movie")
-    export.add_argument("--to", choices=("usd", "html", "vtkhdf", "xyz", "csv"), required=True, help="format")
-    export.add_argument(
-        "-o",
-        dest="output",
-        metavar="FILE",
-        help="default: movie.usdc, cell.html or run.FORMAT in DIR; a movie may end in .usdc, .usda or .usdz",
-    )
-    export.add_argument("--clip-frames", type=int, metavar="N", help="frames per USD value clip (default: by size)")
-    export.add_argument("--mesh", action="store_true", help="a USD movie of meshes, for Blender")
-    export.set_defaults(command=_export)
-
-    for command in (render, export):
-        command.add_argument(
-            "--color", metavar="BY", help="flagellum (default), phase_difference, curvature, steric_force or form"
-        )
-        command.add_argument("--follow", action="store_true", help="the camera goes with the cell")
-        command.add_argument("--fps", type=float, help="pictures per second of the film (default: 50)")
-        command.add_argument(
-            "--slow-down", type=float, metavar="X", help="times slower than the cell (default: a frame per frame)"
-        )
+    view_command.add(commands)
 
     build = commands.add_parser(
         "compile",
@@ -273,6 +208,7 @@ def _compile(options: argparse.Namespace) -> int:
     from warpflag.scene import Scene, load
 
     for scene in [load(path) for path in options.scenes] or [Scene(name="defaults")]:
+        print(f"warpflag: {scene.name}: compiling what is not there yet, up to two minutes", file=sys.stderr)
         simulation = Simulation(scene, device=options.device)
         simulation.prepare(recording=True)
         next(simulation.cell_frames())  # and the kernels that measure the first frame
@@ -293,95 +229,6 @@ def _scene(options: argparse.Namespace) -> Scene:
 
     precision = [f"numerics.precision={options.precision}"] if options.precision else []
     return load(options.scene, [*options.set, *precision])
-
-
-def _plot(options: argparse.Namespace) -> int:
-    os.environ["MPLBACKEND"] = "agg"  # a notebook's own, which a command started there inherits, may not exist here
-    from warpflag.view import figures, sweep_figures
-
-    if sweep_figures.is_sweep(options.directories[0]):
-        figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
-        print(options.output)
-        return DONE
-    if options.x or options.y or options.kind in ("curves", "map"):
-        return _say(f"{options.directories[0]}: is no sweep, which --x, --y, curves and map are for", BAD_INPUT)
-    runs = [figures.read(directory) for directory in options.directories]
-    compared = options.kind == "comparison" or (options.kind is None and len(runs) > 1)
-    if len(runs) > 1 and not compared:
-        return _say("plot --as dashboard takes one DIR", BAD_INPUT)
-    figures.save(figures.comparison(runs) if compared else figures.dashboard(runs[0]), options.output)
-    print(options.output)
-    return DONE
-
-
-def _render(options: argparse.Namespace) -> int:
-    from warpflag.view.notes import can_write
-    from warpflag.view.render import render
-
-    filmed_anew = options.color or options.follow or options.slow_down is not None
-    # Its pictures per second say how often the film looks at the movie, not how fast the movie plays.
-    shot = _shot(options) if filmed_anew else None
-    render(
-        options.source,
-        options.output,
-        shot=shot,
-        times=[1e-3 * time for time in options.times],
-        snapshots=options.snapshots,
-        frames_per_second=options.fps,
-        size=options.size,
-        radius=options.radius,
-        device=options.device,
-        quiet=options.quiet,
-    )
-    if not options.quiet:
-        print(options.output)
-        if not can_write():
-            _say("drawn without time and scale bar: they need Pillow (pip install 'warpflag[render]')", DONE)
-    return DONE
-
-
-def _export(options: argparse.Namespace) -> int:
-    from contextlib import ExitStack
-    from pathlib import Path
-
-    from warpflag.record import Record
-    from warpflag.view import export, page, usd
-
-    name = {"usd": "movie.usdc", "html": "cell.html"}.get(options.to, f"run.{options.to}")
-    path = Path(options.output or Path(options.directories[0]) / name)
-    if len(options.directories) > 1 and (options.to != "usd" or not options.output):
-        return _say("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
-    if options.mesh and options.to != "usd":
-        return _say("--mesh is for movies: --to usd", BAD_INPUT)
-    with ExitStack() as stack:
-        records = [stack.enter_context(Record(directory)) for directory in options.directories]
-        if options.to == "usd":
-            shot = _shot(options, frames_per_second=options.fps, clip_frames=options.clip_frames, mesh=options.mesh)
-            usd.write_movie(records, path, shot)
-        elif options.to == "html":
-            page.write_page(records[0], path, options.color or "flagellum")
-        else:
-            {"vtkhdf": export.write_vtkhdf, "xyz": export.write_xyz, "csv": export.write_csv}[options.to](
-                records[0], path
-            )
-    print(path)
-    return DONE
-
-
-def _shot(options: argparse.Namespace, **more: float | bool | None) -> Shot:
-    """How a movie is to be filmed, by what was said of it."""
-    from warpflag.view.usd import Shot
-
-    said = {"color_by": options.color, "follow": options.follow, "slow_down": options.slow_down, **more}
-    return Shot(**{name: value for name, value in said.items() if value is not None})
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Width and height of "1280x720"."""
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal()):
-        raise argparse.ArgumentTypeError(f"{text} is not of the form 1280x720")
-    return int(width), int(height)
 
 
 def _wall_time(text: str) -> float:

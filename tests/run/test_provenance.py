@@ -16,7 +16,7 @@ import warpflag
 from tests.runs import arrays, assert_same_frames, ended_at, executed, small, summary
 from warpflag import cli
 from warpflag.record import Record, RecordError
-from warpflag.run import checkpoint, run
+from warpflag.run import checkpoint, run, run_directory
 from warpflag.run.checkpoint import CheckpointError
 from warpflag.run.lock import Lock, LockedError
 from warpflag.run.run_directory import RunError
@@ -109,6 +109,13 @@ def test_the_checkpoint_of_another_run_is_refused(tmp_path):
         shutil.copy(path, directory)
     with pytest.raises(RunError, match="checkpoint is of another scene"):
         run.resume(str(directory))
+
+
+def test_a_setting_that_a_later_version_adds_leaves_runs_resumable(tmp_path, monkeypatch):
+    directory = halved(tmp_path / "made")
+    monkeypatch.setattr(run_directory, "dumps", lambda scene: dumps(scene).replace("[steric]", "[steric]\nadded = 0.0"))
+    assert run.resume(str(directory)).execute(quiet=True).status == "done"
+    assert_same_frames(executed(small(), tmp_path / "whole"), directory)
 
 
 def test_the_record_of_another_run_is_refused(tmp_path):

@@ -109,6 +109,13 @@ def test_a_run_stopped_before_its_first_frame_starts_again(tmp_path):
     assert_same_frames(whole, late)
 
 
+def test_a_resumed_run_that_ends_at_once_says_that_its_frames_are_kept(tmp_path):
+    directory = tmp_path / "made"
+    ended_at(run.start(small(), str(directory), "cpu", checkpoint_seconds=0.0), 3)
+    outcome = run.resume(str(directory)).execute(quiet=True, stop=Stop(max_wall=-1.0))
+    assert "are kept; resumable with" in outcome.message and "start again" not in outcome.message
+
+
 def test_a_record_without_any_checkpoint_is_made_again(tmp_path):
     whole, late = executed(small(), tmp_path / "whole"), tmp_path / "late"
     ended_at(run.start(small(), str(late), "cpu"), 3)

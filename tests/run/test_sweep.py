@@ -78,6 +78,10 @@ def test_means_and_standard_errors_are_those_of_the_repeats(tmp_path):
         assert float(mean["rates.net_speed"]) == pytest.approx(speeds.mean(), rel=1e-12)
         error = np.sqrt(((speeds - speeds.mean()) ** 2).sum() / 2) / np.sqrt(3)
         assert float(mean["rates.net_speed.error"]) == pytest.approx(error, rel=1e-12)
+        assert (mean["events.zipped"], mean["events.zipped.count"]) == (
+            "",
+            "0",
+        )  # none zips
         assert "flagellum.0.torque" not in mean  # it differs from repeat to repeat
 
 

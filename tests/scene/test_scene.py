@@ -141,7 +141,13 @@ def test_malformed_scene_is_refused_in_one_line_that_names_file_and_key(tmp_path
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(b"[motor\n", "not valid TOML"), (b"duration = 1\nduration = 2", "not valid TOML"), (b"\xff", "UTF-8")],
+    [
+        (b"[motor\n", "not valid TOML"),
+        (b"name = mine\n", "name = mine; a text needs quotes"),
+        (b"[motor]\ntorque = 1,5\n", "torque = 1,5; numbers have a decimal point"),
+        (b"duration = 1\nduration = 2", "not valid TOML"),
+        (b"\xff", "UTF-8"),
+    ],
 )
 def test_a_file_that_is_no_toml_is_refused(tmp_path, content, words):
     path = tmp_path / "cell.toml"

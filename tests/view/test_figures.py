@@ -156,6 +156,27 @@ def test_command_draws_a_dashboard_of_one_run_and_compares_several(made, monkeyp
     assert len(panels_of(drawn_by_the_command(monkeypatch, run, "--as", "comparison", "-o", "a.png"))) == 3
 
 
+def test_command_draws_the_observables_that_are_named(made, monkeypatch, capsys):
+    run = str(made.directory)
+    assert list(panels_of(drawn_by_the_command(monkeypatch, run, run, "--y", "bundle_length", "-o", "a.png"))) == [
+        LENGTH
+    ]
+    assert cli.main(["plot", run, "--y", "wobble", "-o", "a.png"]) == 2
+    assert "have no wobble in common; they have phase_difference" in capsys.readouterr().err
+
+
+def test_many_flagella_are_drawn_as_mean_and_range(tmp_path):
+    with made_record(tmp_path, 40) as record:
+        assert record.observables["motor_rate"].shape[1] == 3
+    run = figures.read(tmp_path)
+    rates = np.linspace(1.0, 8.0, 8) + np.zeros((40, 8))
+    many = figures.Curve("motor_rate", "motor rate", "", "Hz", rates)
+    (axes,) = figures.dashboard(figures.Run("", run.scene, run.times, {"motor_rate": many})).axes
+    assert axes.get_lines()[0].get_ydata() == pytest.approx(4.5) and len(axes.collections) == 1
+    edge = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert (edge.min(), edge.max()) == (1.0, 8.0)
+
+
 def test_command_writes_the_format_of_the_ending_and_refuses_others(made, tmp_path, capsys):
     good, bad = str(tmp_path / "a.svg"), str(tmp_path / "a.docx")
     assert cli.main(["plot", str(made.directory), "-o", good]) == 0

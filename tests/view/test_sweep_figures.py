@@ -65,6 +65,25 @@ def test_a_second_axis_makes_a_line_each(grid):
     assert [text.get_text() for text in panel.get_legend().get_texts()] == ["mode none", "mode all", "mode within"]
 
 
+def test_points_that_are_not_what_they_say_are_hollow(tmp_path):
+    """Rates of cells that had not zipped when their window began; zip times that not every repeat reached."""
+    rows = ["0,0,0,1.0,done,10,0.010,0.004", "1,0,1,1.0,done,14,0.010,0.006", "2,1,0,2.0,done,20,0.010,0.012"]
+    rows += ["3,1,1,2.0,done,22,0.010,", "4,2,0,3.0,done,31,0.010,0.002", "5,2,1,3.0,done,30,0.010,"]
+    columns = "rates.net_speed,rates.from,events.zipped"
+    table = sweep_figures.read(sweep(tmp_path / "mixed", {"motor.torque": [1.0, 2.0, 3.0]}, rows, columns))
+    figure = sweep_figures.curves(table, numbers=["net_speed", "zipped"])
+    for panel in figure.axes:
+        _, full, hollow = panel.get_lines()[0], *panel.get_lines()[-2:]
+        assert full.get_xdata().tolist() == [1.0] and hollow.get_xdata().tolist() == [2.0, 3.0]
+        assert hollow.get_markerfacecolor() == "white"
+    assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
+    assert "not bundled" in figure._supxlabel.get_text() and "every repeat" in figure._supxlabel.get_text()
+
+
+def test_nothing_is_hollow_where_no_member_zips(grid):
+    assert sweep_figures.curves(sweep_figures.read(grid), numbers=["net_speed"])._supxlabel is None
+
+
 def test_a_map_has_its_axes_in_order(grid):
     figure = sweep_figures.maps(sweep_figures.read(grid))
     panel = figure.axes[0]
@@ -77,7 +96,8 @@ def test_a_map_has_its_axes_in_order(grid):
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["--y", "rates.nothing"], ["no column rates.nothing", "rates.net_speed"]),
+        (["--y", "nothing at all"], ["no column nothing at all", "rates.net_speed"]),
+        (["--y", "net_sped"], ["did you mean rates.net_speed?"]),
         (["--x", "nothing"], ["no column nothing"]),
         (["--y", "status"], ["does not hold numbers"]),
         (["--as", "map"], ["takes two axes"]),

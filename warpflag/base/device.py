@@ -7,11 +7,21 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from warpflag.base.streams import say
 
-__all__ = ["LAUNCHING", "DeviceError", "alone", "find_device", "list_devices", "start_warp"]
+__all__ = [
+    "LAUNCHING",
+    "DeviceError",
+    "alone",
+    "compiled_modules",
+    "find_device",
+    "kernel_folder",
+    "list_devices",
+    "start_warp",
+]
 
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -82,6 +92,19 @@ def find_device(name: Any = None) -> Any:
     except Exception as error:
         aliases = ", ".join(device.alias for device in wp.get_devices())
         raise DeviceError(f"device {name}: not here; this machine has {aliases}") from error
+
+
+def kernel_folder() -> Path:
+    """Where Warp keeps compiled kernels: WARP_CACHE_PATH, or a folder of the user's cache."""
+    return Path(start_warp().config.kernel_cache_dir)
+
+
+def compiled_modules() -> set[str]:
+    """Modules of kernels in the cache; one that is just being compiled is there, too."""
+    try:
+        return set(os.listdir(kernel_folder()))
+    except OSError:
+        return set()
 
 
 def list_devices() -> list[str]:

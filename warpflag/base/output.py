@@ -8,11 +8,21 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["DiskError", "OutputError", "machine_error", "whole"]
+__all__ = ["DiskError", "OutputError", "machine_error", "missing", "whole"]
 
 
 class OutputError(ValueError):
     """A movie, picture or export that can't be made as it was asked for; the message is one line."""
+
+
+def missing(package: str, extra: str) -> str:
+    """How to get a package that is not installed, for a message.
+
+    Args:
+        package: its name for pip.
+        extra: of this program that has it.
+    """
+    return f"pip install {package}, or uv run --extra {extra} ..."
 
 
 class DiskError(OSError):
@@ -61,6 +71,7 @@ def machine_error(error: OSError) -> str:
     if not error.filename:
         return str(error)
     cache = getattr(getattr(sys.modules.get("warp"), "config", None), "kernel_cache_dir", None)
-    kept = bool(cache) and os.path.realpath(os.fsdecode(error.filename)).startswith(os.path.realpath(str(cache)))
+    place, cache = os.path.realpath(os.fsdecode(error.filename)), os.path.realpath(str(cache)) if cache else ""
+    kept = bool(cache) and (place.startswith(cache) or place == os.path.dirname(cache))
     advice = "; kernels are kept there: let WARP_CACHE_PATH name a folder that can be written" if kept else ""
     return f"{error.filename}: {error.strerror}{advice}"

@@ -59,6 +59,8 @@ class Evaluation:
         first: index of r_0 of every flagellum, shape [flagellum_count].
         motor_torques: of the motors about their axes [pN um], shape [flagellum_count].
         supplied: power of motors and of external forces [pN um/s], by the name of the term.
+        positions: nodes [um], shape [node_count, 3].
+        body_position: centre of the body [um], shape [3].
         body_force: sum of the forces on the body [pN], shape [3].
         body_torque: sum of the torques on the body about its centre [pN um], shape [3].
         body_velocity: of the body's centre [um/s], shape [3].
@@ -73,6 +75,8 @@ class Evaluation:
     first: np.ndarray
     motor_torques: np.ndarray
     supplied: Mapping[str, float]
+    positions: np.ndarray
+    body_position: np.ndarray
     body_force: np.ndarray
     body_torque: np.ndarray
     body_velocity: np.ndarray

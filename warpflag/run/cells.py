@@ -159,6 +159,8 @@ def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -
         first=first_node[:-1] - nodes.start,
         motor_torques=motor_torques(system)[flagella],
         supplied={},
+        positions=host(state.pose.position, nodes) + host(state.pose.body_position, cell),
+        body_position=host(state.pose.body_position, cell),
         body_force=host(state.flagellum_force, flagella).sum(axis=0),
         body_torque=host(state.flagellum_torque, flagella).sum(axis=0),
         body_velocity=host(state.body_velocity, cell),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from warpflag_kernels.stepping.health import Fault
 
-from warpflag.base.device import start_warp
+from warpflag.base.device import compiled_modules, kernel_folder
 from warpflag.base.progress import Progress
 from warpflag.base.streams import say
 from warpflag.record import Frame, RecordError
@@ -126,9 +126,14 @@ class Run:
             self._end(ended)
 
     def _prepare(self, quiet: bool, stop: Stop) -> None:
-        folder = start_warp().config.kernel_cache_dir
-        said = f"warpflag: compiling kernels, once for each kind of scene, up to two minutes; kept in {folder}\n"
-        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, say, [said])
+        before = compiled_modules()
+
+        def explain() -> None:
+            if compiled_modules() - before:
+                kinds = "compiling kernels, once for each kind of scene, up to two minutes"
+                say(f"warpflag: {kinds}; kept in {kernel_folder()}\n")
+
+        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, explain)
         if not quiet:
             timer.start()
         stop.at_once = True

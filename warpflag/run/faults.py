@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ _ADVICE = {
     ),
     Fault.BALANCE: (
         "steps gain energy that nothing puts in, or lose more than the fluid takes: power balance violated",
-        "take numerics.stepper = rkc",
+        "compare with numerics.stepper = rkc; a new term whose force is not that of its energy does this, too",
     ),
     Fault.UNSTABLE: (
         "the fixed step is beyond what its stages keep stable",
@@ -49,6 +50,7 @@ _ADVICE = {
 _OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE)
 """Faults of a cell as a whole: no segment is to blame."""
 _NOTABLE = 3.0  # a value this many times from the default is named
+_EXTERNAL = 1.0  # weight of a force from outside among the causes, that of a value e times its default
 _CROWDED = 3.0  # anchors nearer than so many diameters are named
 
 
@@ -91,6 +93,8 @@ def likely_causes(scene: Scene) -> list[str]:
         diameters = apart / (4 * scene.flagella.filament_radius)
         if diameters < _CROWDED:
             found.append((math.log(_CROWDED / diameters) + 1.0, f"anchors {apart:.3g} um apart crowd the flagella"))
+    pulls = [(field.name, getattr(scene.external, field.name)) for field in dataclasses.fields(scene.external)]
+    found += [(_EXTERNAL, f"external.{name} = {value}") for name, value in pulls if np.any(np.asarray(value))]
     if scene.start.record is not None:
         found.append((0.0, "start.record, made with another scene"))
     return [words for _, words in sorted(found, key=lambda one: -one[0])]

@@ -22,7 +22,7 @@ from warpflag.run import checkpoint
 from warpflag.run.faults import NumericalError
 from warpflag.run.growth import growth_words
 from warpflag.run.lock import Lock
-from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, dynamics_sha256, write_whole
+from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, settings_sha256, write_whole
 from warpflag.run.stop import Ended
 from warpflag.run.summary import digest, kept_words, plain
 from warpflag.scene import Scene
@@ -113,7 +113,7 @@ class Member:
             "time": time,
             "wall_time": self.wall_time,
             "device": device,
-            "motion_sha256": dynamics_sha256(self.scene),
+            "settings_sha256": settings_sha256(self.scene),
             "versions": versions(),
         }
         self.recorder.flush()
@@ -165,10 +165,12 @@ class Member:
         """Summary and movie of the record; returns what the user is told."""
         how = status + (f" ({ended.reason})" if ended and ended.reason else "")
         if self.recorder.frame_count == 0:
+            if (self.directory / RECORD_NAME).exists():
+                return f"{how} before a new frame, those of before are kept; resumable with --resume {self.directory}"
             return f"{how} before the first frame; start again with --resume {self.directory}"
         with Record(self.directory) as record:
-            found = digest(record, self.scene)
-            ending = {"status": status, "message": str(fault) if fault else "", "wall_time": self.wall_time}
+            found, taken = digest(record, self.scene), self.wall_time
+            ending = {"status": status, "message": str(fault) if fault else "", "wall_time": taken}
             summary = {**ending, **facts, **found}
             write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
             left_out = "" if not movie or ended is None else "; movie left out"
@@ -181,7 +183,7 @@ class Member:
         kept = "; ".join(filter(None, (kept_words(facts["accuracy"]), grown)))
         if status == "done":
             said = f", {kept}" if kept else ""
-            return f"{reached} in {self.wall_time:.1f} s{said}: {self.directory}{left_out}"
+            return f"{reached} in {taken:.1f} s{said}: {self.directory}{left_out}"
         if status == "stopped":
             said = f"; {kept}" if kept else ""
             return f"{fault}{said}; {reached} kept in {self.directory}{left_out}"

@@ -26,9 +26,8 @@ from warpflag.run.run_directory import (
     SUMMARY_NAME,
     RunError,
     claim_directory,
-    dynamics_sha256,
+    is_of_scene,
     recorded_scene,
-    text_sha256,
     write_whole,
 )
 from warpflag.run.simulation import Simulation
@@ -185,9 +184,9 @@ def begun_at_checkpoint(directory: Path) -> bool:
 def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The latest checkpoint whose frame the record holds."""
     with Record(path) as record:
-        times = record.times
+        times, texts = record.times, [(path / SCENE_NAME).read_text(encoding="utf-8"), record.scene_text]
     arrays, meta = checkpoint.load(path, lambda meta: bool((np.abs(times - meta["time"]) <= 1e-12 * times[-1]).any()))
-    if not _is_of(meta, path, scene):
+    if not is_of_scene(meta, scene, texts):
         raise RunError(f"--resume {path}: its checkpoint is of another scene than {SCENE_NAME}")
     if scene.duration < meta["time"] * (1 - 1e-9):
         problem = f"must not be below {meta['time']:g} s, where the run stands"
@@ -195,15 +194,6 @@ def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[s
     if (written := meta["versions"]["warpflag"]) != __version__:
         print(f"warpflag: {path} was written by version {written}, this is {__version__}", file=sys.stderr)
     return arrays, meta
-
-
-def _is_of(meta: dict[str, Any], path: Path, scene: Scene) -> bool:
-    """Whether a checkpoint is of the run's scene; older ones hash the text of that time."""
-    if "motion_sha256" in meta:
-        return meta["motion_sha256"] == dynamics_sha256(scene)
-    with Record(path) as record:
-        texts = [(path / SCENE_NAME).read_text(encoding="utf-8"), record.scene_text]
-    return any(meta.get("dynamics_sha256") == text_sha256(text) for text in texts)
 
 
 def _is_done(path: Path, scene: Scene) -> bool:

@@ -7,7 +7,9 @@ import errno
 import hashlib
 import itertools
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from warpflag.base.output import whole
 from warpflag.record import RECORD_NAME, Record
@@ -21,13 +23,15 @@ __all__ = [
     "RunError",
     "check_same_scene",
     "claim_directory",
-    "dynamics_sha256",
+    "is_of_scene",
     "recorded_scene",
-    "text_sha256",
+    "settings_of",
+    "settings_sha256",
     "write_whole",
 ]
 
 MOVIE_NAME, SCENE_NAME, SUMMARY_NAME = "movie.usdc", "scene.toml", "summary.json"
+_NOT_OF_THE_MOTION = ("duration", "frames", "behaviour")
 
 
 class RunError(ValueError):
@@ -84,19 +88,39 @@ def write_whole(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def dynamics_sha256(scene: Scene) -> str:
-    """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion."""
-    values = re.sub(r" *#.*", "", _dynamics(dumps(scene)))  # what a comment says may change from version to version
-    return hashlib.sha256(values.encode()).hexdigest()
+def settings_sha256(scene: Scene) -> str:
+    """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion.
+
+    Only what differs from the defaults counts, so that a setting that a later version adds changes nothing.
+    """
+    values, default = settings_of(scene), settings_of(Scene(name=scene.name))
+    lines = [f"{key} = {value}" for key, value in values.items() if value != default.get(key, "none")]
+    chosen = sorted(line for line in lines if line.partition(" ")[0] not in _NOT_OF_THE_MOTION)
+    return hashlib.sha256("\n".join(chosen).encode()).hexdigest()
 
 
-def text_sha256(text: str) -> str:
-    """The same of a scene's text as it is, comments and all."""
-    return hashlib.sha256(_dynamics(text).encode()).hexdigest()
+def is_of_scene(meta: Mapping[str, Any], scene: Scene, texts: Iterable[str]) -> bool:
+    """Whether a checkpoint is of a scene.
+
+    Args:
+        meta: of the checkpoint.
+        scene: of the run.
+        texts: of the scene in the run's files, which checkpoints of earlier versions hash.
+    """
+    if "settings_sha256" in meta:
+        return meta["settings_sha256"] == settings_sha256(scene)
+    if "motion_sha256" in meta:
+        values = [re.sub(r" *#.*", "", _dynamics(text)) for text in (*texts, dumps(scene))]
+        return any(meta["motion_sha256"] == _sha256(text) for text in values)
+    return any(meta.get("dynamics_sha256") == _sha256(_dynamics(text)) for text in texts)
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _dynamics(text: str) -> str:
-    return re.sub(r"^(duration|frames|behaviour) = .*\n", "", text, flags=re.MULTILINE)
+    return re.sub(rf"^({'|'.join(_NOT_OF_THE_MOTION)}) = .*\n", "", text, flags=re.MULTILINE)
 
 
 def recorded_scene(directory: Path, prolonged: bool) -> Scene:
@@ -147,19 +171,20 @@ def check_same_scene(directory: Path, scene: Scene) -> None:
 
 def _difference(recorded: Scene, scene: Scene) -> str:
     """The first setting in which two scenes differ, in words."""
-    section, sections = "", []
-    for text in (dumps(recorded), dumps(scene)):
-        settings: dict[str, str] = {}
-        tables = 0
-        for line in text.splitlines():
-            if header := re.match(r"\[+([\w.]+)\]+", line):
-                section = header[1]
-                if line.startswith("[["):
-                    section, tables = f"{section}.{tables}", tables + 1
-            elif value := re.match(r"(?:# )?(\w+) =\s*(.*?)\s*(?:#.*)?$", line):
-                settings[f"{section}.{value[1]}".lstrip(".")] = value[2] or "none"
-        sections.append(settings)
-        section = ""
-    old, new = sections
+    old, new = settings_of(recorded), settings_of(scene)
     key = next(key for key in [*old, *new] if old.get(key) != new.get(key))
     return f"{key} = {new.get(key, 'none')}, recorded with {old.get(key, 'none')}"
+
+
+def settings_of(scene: Scene) -> dict[str, str]:
+    """All values of a scene as they are written, by dotted key; "none" where a value is absent."""
+    settings: dict[str, str] = {}
+    section, tables = "", 0
+    for line in dumps(scene).splitlines():
+        if header := re.match(r"\[+([\w.]+)\]+", line):
+            section = header[1]
+            if line.startswith("[["):
+                section, tables = f"{section}.{tables}", tables + 1
+        elif value := re.match(r"(?:# )?(\w+) =\s*(.*?)\s*(?:#.*)?$", line):
+            settings[f"{section}.{value[1]}".lstrip(".")] = value[2] or "none"
+    return settings

@@ -82,9 +82,9 @@ def kept_words(facts: Mapping[str, Any]) -> str:
     if facts["estimate"] is None:
         return ""
     mean, worst = facts["estimate"] / facts["asked"], facts["worst_window"] / facts["asked"]
-    words = f"error estimate {mean:.2g} times {facts['asked']:g} um/ms"
+    words = f"error estimate {mean:.2g} times the {facts['asked']:g} um/ms asked for"
     if worst > max(_NOTABLE, _NOTABLE * mean):
-        words += f", {worst:.2g} times in 0.1 ms up to {1e3 * facts['worst_window_end']:.4g} ms"
+        words += f" (worst {worst:.2g} times, just before {1e3 * facts['worst_window_end']:.4g} ms)"
     if facts["steps_at_shortest"]:
         words += f", {facts['steps_at_shortest']} steps as short as estimates may ask for"
     return words

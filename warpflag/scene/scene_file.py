@@ -19,6 +19,7 @@ __all__ = ["flattened", "nearest", "parsed", "read_overrides", "read_toml", "sec
 # Beyond any sensible scene, and below what the parser of TOML takes much time or memory for. Ten thousand flagella
 # with every key of their own, as `dumps` writes them, are 3 MB.
 _MOST_BYTES = 4 * 2**20
+_LONGEST_QUOTE = 80  # characters of a line that an error shows
 _DEEPEST = 16  # levels of arrays, inline tables and dotted keys
 _MOST_DIGITS = 1000
 
@@ -53,7 +54,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     except SceneError as error:
         raise error.located(path) from None
     except FileNotFoundError:
-        problem = "no such file"
+        meant = path.with_name(f"{path.name}.toml")
+        problem = "no such file" + (f"; did you mean {meant}?" if meant.is_file() else "")
     except UnicodeDecodeError:
         problem = "is not a text file in UTF-8"
     except OSError as error:
@@ -73,7 +75,22 @@ def parsed(toml: str) -> dict[str, Any]:
     try:
         return tomllib.loads(toml)
     except (ValueError, RecursionError) as error:  # of TOML, and of numbers and dates beyond Python's
-        raise SceneError(None, None, f"is not valid TOML: {' '.join(str(error).split())[:200]}") from None
+        problem = f"is not valid TOML: {' '.join(str(error).split())[:200]}"
+        raise SceneError(None, None, problem + _line_of(toml, str(error))) from None
+
+
+def _line_of(toml: str, message: str) -> str:
+    """The line in which the parser found something wrong, and what it often is."""
+    place = re.search(r"at line (\d+)", message)
+    if place is None or not toml.splitlines()[int(place[1]) - 1 : int(place[1])]:
+        return ""
+    line = toml.splitlines()[int(place[1]) - 1].strip()
+    hint = ""
+    if re.fullmatch(r"[\w.-]+\s*=\s*[A-Za-z_][^\"'\[{]*", line) and not re.search(r"=\s*(true|false|inf|nan)\b", line):
+        hint = "; a text needs quotes"
+    elif re.search(r"=\s*[-+]?\d+,\d", line):
+        hint = "; numbers have a decimal point"
+    return f": {line[:_LONGEST_QUOTE]}{hint}" if line.isprintable() else ""
 
 
 def _refuse_size(size: int) -> None:

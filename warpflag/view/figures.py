@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpflag.base.output import OutputError, whole
+from warpflag.base.output import OutputError, missing, whole
 from warpflag.observables.arrays import Array
 from warpflag.record import Record, RecordError
 from warpflag.scene import Scene, loads
@@ -52,7 +52,8 @@ COLORS = [FLAGELLUM_COLORS[k] for k in (1, 0, *range(2, len(FLAGELLUM_COLORS)))]
 
 _LINE_STYLES = ("-", "--", ":", "-.")
 _BUNDLING = ("phase_difference", "bundle_length", "steric_force_density")
-_SWIMMING = ("body_speed", "body_rate", "elastic_energy")
+_SWIMMING = ("body_speed", "body_rate")
+_FEW = 4  # lines of a panel that can be told apart; of more, mean and range are drawn
 _SHARE_IN_VIEW = 0.99  # of the values of a panel, at least
 _PEAK = 1.6  # a panel shows all values when they reach no further than this times what that share needs
 
@@ -118,6 +119,13 @@ def dashboard(run: Run | str | Path) -> Figure:
             _draw_forms(panels[-1], run)
         for axes, curve in zip(panels[: len(run.curves)], run.curves.values(), strict=True):
             many = curve.values.shape[1] > 1
+            if curve.values.shape[1] > _FEW:
+                low, high = curve.values.min(axis=1), curve.values.max(axis=1)
+                axes.fill_between(run.times, low, high, color=COLORS[0], alpha=0.25, linewidth=0)
+                axes.plot(run.times, curve.values.mean(axis=1), color=COLORS[0])
+                _set_range(axes, [curve])
+                axes.set_title(f"{_title(curve)}, mean and range of all flagella", loc="left")
+                continue
             for k, line in enumerate(curve.values.T):
                 color = FLAGELLUM_COLORS[k % len(FLAGELLUM_COLORS)] if many else COLORS[0]
                 axes.plot(run.times, line, color=color, linewidth=0.8 if many else None)
@@ -151,16 +159,17 @@ def _draw_forms(axes: Any, run: Run) -> None:
     axes.legend(handles=patches, loc="upper right", ncols=len(names), frameon=True, borderpad=0.2)
 
 
-def comparison(runs: Sequence[Run | str | Path]) -> Figure:
-    """Phase difference, bundle length and contact force of several runs over time, a panel each.
-
-    Cells with one flagellum have none of them: where one is among the runs, speed, body rate and energy are drawn.
+def comparison(runs: Sequence[Run | str | Path], names: Sequence[str] = ()) -> Figure:
+    """Observables of several runs over time, a panel each; of those with a value per flagellum, the mean.
 
     Args:
+        names: of the observables; by default phase difference, bundle length, contact force, speed and body rate, of
+            which cells with one flagellum have the last two, and then the elastic energy.
         runs: what `read` gave, or run directories. Runs without a label are labelled by what differs between their
             scenes; where that is one number, they are coloured by it.
 
     Raises:
+        OutputError: some run has no observable of that name.
         RecordError: no record, or one without frames.
     """
     read_runs = [run if isinstance(run, Run) else read(run) for run in runs]
@@ -168,16 +177,13 @@ def comparison(runs: Sequence[Run | str | Path]) -> Figure:
     labels = [run.label or label for run, label in zip(read_runs, labels, strict=True)]
     if any(run.label for run in read_runs):
         title, values = "", None
-    names = [name for name in _BUNDLING if all(name in run.curves for run in read_runs)]
-    names = names or [name for name in _SWIMMING if all(name in run.curves for run in read_runs)]
-    if not names:
-        raise OutputError("these runs have no observable in common that could be compared")
+    names = _compared(read_runs, names)
     with styled() as figure_of:
         figure = figure_of(figsize=(TWO_COLUMNS * 0.75, 0.6 + 1.5 * len(names)), layout="constrained")
         panels = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
         for axes, name in zip(panels, names, strict=True):
             for run, style in zip(read_runs, _styles(len(read_runs), values), strict=True):
-                axes.plot(run.times, run.curves[name].values[:, 0], **style)
+                axes.plot(run.times, run.curves[name].values.mean(axis=1), **style)
             found = [run.curves[name] for run in read_runs]
             _set_range(axes, found)
             axes.set_title(_title(found[0]), loc="left")
@@ -186,6 +192,19 @@ def comparison(runs: Sequence[Run | str | Path]) -> Figure:
             columns = -(-len(read_runs) // 24)
             figure.legend(panels[0].get_lines(), labels, loc="outside right upper", title=title or None, ncols=columns)
     return figure
+
+
+def _compared(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
+    """The observables to compare: those named, or the usual ones that all runs have."""
+    shared = [name for name in runs[0].curves if all(name in run.curves for run in runs)]
+    if unknown := [name for name in names if name not in shared]:
+        raise OutputError(f"these runs have no {unknown[0]} in common; they have {', '.join(shared)}")
+    found = list(names) or [name for name in (*_BUNDLING, *_SWIMMING) if name in shared]
+    if not names and len(found) < len(_BUNDLING) and "elastic_energy" in shared:
+        found.append("elastic_energy")
+    if not found:
+        raise OutputError("these runs have no observable in common that could be compared")
+    return found
 
 
 def save(figure: Figure, path: str | Path, dpi: float = 300) -> None:
@@ -219,7 +238,7 @@ def styled() -> Iterator[Any]:
     try:
         import matplotlib
     except ImportError:
-        raise OutputError("figures need matplotlib: pip install 'warpflag[plot]'") from None
+        raise OutputError(f"figures need matplotlib: {missing('matplotlib', 'plot')}") from None
     with matplotlib.rc_context(STYLE):
         yield _figure_class()
 

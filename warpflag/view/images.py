@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warpflag.base.output import OutputError, whole
+from warpflag.base.output import OutputError, missing, whole
 
 __all__ = ["ANIMATIONS", "PICTURES", "check_rate", "check_writable", "write_animation", "write_picture"]
 
@@ -118,7 +118,7 @@ def _pillow(suffix: str) -> Any:
     try:
         from PIL import Image, features
     except ImportError:
-        raise OutputError(f"{suffix} needs the package Pillow: pip install 'warpflag[render]'") from None
+        raise OutputError(f"{suffix} needs the package Pillow: {missing('Pillow', 'render')}") from None
     if suffix == ".webp" and not features.check("webp"):
         raise OutputError(".webp needs a Pillow with WebP")
     return Image
@@ -154,7 +154,7 @@ def _ffmpeg() -> str:
     try:
         from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise OutputError(".mp4 needs ffmpeg on the PATH, or pip install 'warpflag[render]'") from None
+        raise OutputError(f".mp4 needs ffmpeg on the PATH, or {missing('imageio-ffmpeg', 'render')}") from None
     return get_ffmpeg_exe()
 
 

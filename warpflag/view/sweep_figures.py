@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import math
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpflag.base.output import OutputError
+from warpflag.base.output import OutputError, missing
 from warpflag.observables.arrays import Array
 from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
 
@@ -67,13 +68,39 @@ class Table:
         Raises:
             OutputError: there is no such column, or it does not hold numbers.
         """
-        if name not in self.columns:
-            known = [column for column in self.columns if column not in _BEFORE_NUMBERS and not column[-1].isdecimal()]
-            raise OutputError(f"{self.name}: has no column {name}; it has {', '.join(known)}")
         try:
-            return np.array([float(text) if text else math.nan for text in self.columns[name]])
+            return np.array([float(text) if text else math.nan for text in self.columns[self.full_name(name)]])
         except ValueError:
             raise OutputError(f"{self.name}: column {name} does not hold numbers") from None
+
+    def full_name(self, name: str) -> str:
+        """The column of a name, which may be the last part of one alone: net_speed for rates.net_speed.
+
+        Raises:
+            OutputError: there is no such column, or several.
+        """
+        if name in self.columns:
+            return name
+        known = [column for column in self.columns if column not in _BEFORE_NUMBERS and not column[-1].isdecimal()]
+        ending = [column for column in known if column.endswith(f".{name}")]
+        if len(ending) == 1:
+            return ending[0]
+        leaves = {column.rpartition(".")[2]: column for column in known}
+        near = [leaves[leaf] for leaf in difflib.get_close_matches(name.rpartition(".")[2], leaves, 3, 0.7)]
+        said = f"did you mean {' or '.join(ending or near)}?" if ending or near else f"it has {', '.join(known)}"
+        raise OutputError(f"{self.name}: has no column {name}; {said}")
+
+    def whole(self, name: str) -> np.ndarray:
+        """Rows whose number stands for what its name says: of rates, those that had zipped when their window began.
+
+        Where no row has zipped, nobody waits for that, and every row counts. Of anything but rates, those that have it.
+        """
+        if name.startswith("rates.") and {"events.zipped", "rates.from"} <= self.columns.keys():
+            zipped = self.numbers("events.zipped")
+            if np.isfinite(zipped).any():
+                return zipped <= self.numbers("rates.from")
+            return np.ones(len(zipped), dtype=bool)
+        return np.isfinite(self.numbers(name))
 
     def levels(self, name: str) -> tuple[list[str], Array]:
         """Values of an axis as text, each once in order of size, and which of them each row has."""
@@ -140,7 +167,7 @@ def _style() -> Iterator[None]:
     try:
         import matplotlib
     except ImportError:
-        raise OutputError("figures need matplotlib: install warpflag with its extra, warpflag[plot]") from None
+        raise OutputError(f"figures need matplotlib: {missing('matplotlib', 'plot')}") from None
     matplotlib.use("agg")
     style: Any = STYLE
     with matplotlib.rc_context(style):
@@ -150,6 +177,8 @@ def _style() -> Iterator[None]:
 @_style()
 def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> Figure:
     """A panel per number against one column; mean and standard error where rows share it; a line per second axis.
+
+    A point is hollow where it does not stand for all that its name says: see `Table.whole`.
 
     Args:
         table: of a sweep.
@@ -162,22 +191,44 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
     x, numbers = _abscissa(table, x), _drawn(table, numbers)
     position, others = table.numbers(x), [axis for axis in table.axes if axis != x]
     lines, line_of = table.levels(others[0]) if others else ([""], np.zeros(len(position), dtype=int))
+    from matplotlib.lines import Line2D
+
     figure, panels = _panels(len(numbers))
+    notes: dict[str, None] = {}
     for panel, name in zip(panels, numbers, strict=True):
-        values = _UNITS.get(_leaf(name), ("", 1.0))[1] * table.numbers(name)
-        for k, line in enumerate(lines):
+        values, whole = _UNITS.get(_leaf(name), ("", 1.0))[1] * table.numbers(name), table.whole(name)
+        for k in range(len(lines)):
             places = np.unique(position[line_of == k])
-            rows = [values[(line_of == k) & (position == place) & np.isfinite(values)] for place in places]
-            means = [row.mean() if len(row) else math.nan for row in rows]
+            here = [(line_of == k) & (position == place) for place in places]
+            rows = [values[at & np.isfinite(values)] for at in here]
+            means = np.array([row.mean() if len(row) else math.nan for row in rows])
             errors = [row.std(ddof=1) / math.sqrt(len(row)) if len(row) > 1 else 0.0 for row in rows]
-            label = f"{_leaf(others[0])} {_short(line)}".replace("_", " ") if others else None
             color = COLORS[k % len(COLORS)]
-            panel.errorbar(places, means, errors, marker="o", markersize=3, capsize=2, color=color, label=label)
+            panel.errorbar(places, means, errors, capsize=2, color=color)
+            full = np.array([bool(whole[at].all()) for at in here])
+            panel.plot(places[full], means[full], "o", markersize=3.5, color=color)
+            hollow = ~full & np.isfinite(means)
+            panel.plot(places[hollow], means[hollow], "o", markersize=3.5, color=color, markerfacecolor="white")
+            if hollow.any():
+                rate = name.startswith("rates.")
+                notes["not bundled when the window of rates began" if rate else "not reached by every repeat"] = None
         panel.set_xlabel(_label(x))
         panel.set_ylabel(_label(name))
+        panel.set_xlim(*_with_margin(position))
     if others:
-        panels[0].legend()
+        handles = [Line2D([], [], marker="o", markersize=3.5, color=COLORS[k % len(COLORS)]) for k in range(len(lines))]
+        labels = [f"{_leaf(others[0])} {_short(line)}".replace("_", " ") for line in lines]
+        panels[0].legend(handles, labels)
+    if notes:
+        figure.supxlabel("hollow: " + "; ".join(notes), fontsize=7)
     return figure
+
+
+def _with_margin(position: Array) -> tuple[float, float]:
+    """The range of an abscissa, the same in every panel, with room for the markers."""
+    low, high = float(np.nanmin(position)), float(np.nanmax(position))
+    room = 0.04 * (high - low) or 0.5
+    return low - room, high + room
 
 
 @_style()
@@ -221,13 +272,13 @@ def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
 def _abscissa(table: Table, x: str | None) -> str:
     if x is None and not table.axes:
         raise OutputError(f"{table.name}: has no axis; name the column to draw against with --x")
-    return table.axes[0] if x is None else x
+    return table.axes[0] if x is None else table.full_name(x)
 
 
 def _drawn(table: Table, numbers: Sequence[str]) -> list[str]:
     """The columns to draw."""
     if numbers:
-        return list(numbers)
+        return [table.full_name(name) for name in numbers]
     found = [name for name in DEFAULT_NUMBERS if name in table.columns and np.isfinite(table.numbers(name)).any()]
     if not found:
         raise OutputError(f"{table.name}: no member has anything to draw yet")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.base.output import OutputError
+from warpflag.base.output import OutputError, missing
 from warpflag.record import Record
 from warpflag.record.layout import BODY_ORIENTATION, BODY_POSITION, E1, MOTOR_ANGLE, POSITION, UNITS
 
@@ -34,7 +34,7 @@ def dataset(record: Record) -> Any:
     try:
         import xarray  # pyright: ignore[reportMissingImports]
     except ImportError:
-        raise OutputError("labelled arrays need xarray: pip install 'warpflag[notebook]'") from None
+        raise OutputError(f"labelled arrays need xarray: {missing('xarray', 'notebook')}") from None
     values = {
         "position": record.positions[:],
         "director": record.directors[:],

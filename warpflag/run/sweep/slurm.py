@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from warpflag.base.output import missing
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
 from warpflag.run.sweep.sweep import FINISHED, SweepRun
@@ -118,7 +119,7 @@ class Jobs:
         try:
             import submitit  # pyright: ignore[reportMissingImports]
         except ImportError:
-            raise RunError("--slurm needs submitit: install warpflag with its extra, warpflag[slurm]") from None
+            raise RunError(f"--slurm needs submitit: {missing('submitit', 'slurm')}") from None
         directory, count = self.sweep.directory, self.jobs()
         options: dict[str, Any] = {
             "name": self.sweep.sweep.name,

@@ -102,6 +102,8 @@ def _means(rows: Sequence[Mapping[str, Any]], varied: Sequence[str]) -> list[dic
             values = values[np.isfinite(values)]
             mean[name] = float(values.mean()) if len(values) else math.nan
             mean[f"{name}.error"] = float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
+            if name.startswith("events."):
+                mean[f"{name}.count"] = len(values)  # the others had not got there when they ended
         means.append(mean)
     return means
 
@@ -120,7 +122,7 @@ def _cell(value: Any) -> Any:
 
 
 def _write_hdf5(path: Path, tables: Mapping[str, tuple[Sequence[str], Sequence[Mapping[str, Any]]]]) -> None:
-    """One compound dataset per table: numbers as float64, all else as text."""
+    """One compound dataset per table: whole numbers as int64, other numbers as float64, all else as text."""
     import h5py
 
     with whole(path) as temporary, h5py.File(temporary, "w") as file:
@@ -129,7 +131,9 @@ def _write_hdf5(path: Path, tables: Mapping[str, tuple[Sequence[str], Sequence[M
             table = np.zeros(len(rows), dtype=kinds)
             for column, kind in kinds:
                 values = [row.get(column) for row in rows]
-                if kind is np.float64:
+                if kind is np.int64:
+                    table[column] = values
+                elif kind is np.float64:
                     table[column] = [math.nan if value is None else value for value in values]
                 else:
                     table[column] = ["" if value is None else str(value) for value in values]
@@ -139,5 +143,7 @@ def _write_hdf5(path: Path, tables: Mapping[str, tuple[Sequence[str], Sequence[M
 def _kind(values: Sequence[Any]) -> Any:
     import h5py
 
+    if all(isinstance(value, int) and not isinstance(value, bool) for value in values):
+        return np.int64
     numbers = all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values)
     return np.float64 if numbers else h5py.string_dtype()
