@@ -46,7 +46,7 @@ THETA = 0.8
 # Error estimate over the mean predictor error of a cell's nodes, for theta = 1; measured. The mean is controlled,
 # since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
 ERROR_PER_PREDICTOR = 7.0
-GAP_SHARE = 0.35  # residual of the gaps that the contact solve may leave, over the error that a step may make
+GAP_SHARE = 0.1  # residual of the gaps that the contact solve may leave, over the error that a step may make
 # A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
 GAP_GROWTH = 4.0e9
 
