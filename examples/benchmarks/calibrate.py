@@ -115,7 +115,7 @@ DRIVER = "warpflag"
 CONSTANTS = {
     "collocation.THETA": Constant("implicit.collocation", (0.8, 0.72, 0.75, 0.85, 0.9, 1.0), (*TWO, "crowd", "taut")),
     "collocation.ERROR_PER_PREDICTOR": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
-    "collocation.GAP_SHARE": Constant("implicit.collocation", (0.35, 0.05, 0.15, 0.7, 1.5, 4.0), TOUCHING),
+    "collocation.GAP_SHARE": Constant("implicit.collocation", (0.1, 0.03, 0.05, 0.2, 0.35, 0.7), TOUCHING),
     "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING, FIXED),
     "step_control.REJECTED": Constant("stepping.step_control", (25.0, 3.0, 8.0, 80.0, 1e6), UPSET),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
