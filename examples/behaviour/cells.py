@@ -12,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from warpflag import Record, RecordError
+from warpflag import Record
+from warpflag.record import RecordError
 
 options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 options.add_argument("directory", type=Path)
+options.add_argument("--members", type=int, nargs=2, metavar=("FIRST", "COUNT"), default=(0, 10_000))
 options.add_argument("-o", dest="output", type=Path, default=Path("cells.png"))
 options = options.parse_args()
 
@@ -26,13 +28,20 @@ def of_cell(path: Path) -> dict[str, np.ndarray]:
         found = record.runs_and_tumbles()
         length, drive = record.observables["bundle_length"], record.observables["motor_drive"]
         reverse = (drive < 0).any(axis=1)
-        whole = (found.tumbles[:, 0] > record.times[0]) & (found.tumbles[:, 1] < record.times[-1])
-        inner = (found.runs[:, 0] > record.times[0]) & (found.runs[:, 1] < record.times[-1])
         late = record.times > 0.15
+        # Motors that are in reverse at some time in a tumble, or within the time over which the path is averaged.
+        around = [(record.times > a - 0.06) & (record.times < b + 0.06) for a, b in found.tumbles]
+        motors = np.array([(drive[window] < 0).any(axis=0).sum() for window in around])
+        known = np.isfinite(found.tumble_angles)
+    angle, duration = np.degrees(found.tumble_angles[known]), np.diff(found.tumbles, axis=1)[known, 0]
     return {
-        "angle": np.degrees(found.tumble_angles[np.isfinite(found.tumble_angles)]),
-        "tumble": found.tumble_durations[whole],
-        "run": found.run_durations[inner],
+        "angle": angle,
+        "angle, from 0.1 s on": angle[duration >= 0.1],
+        "angle, from 0.2 s on": angle[duration >= 0.2],
+        "angle, one motor": angle[motors[known] <= 1],
+        "angle, two or three": angle[motors[known] >= 2],
+        "tumble": found.tumble_durations,
+        "run": found.run_durations,
         "speed": np.array([found.run_speed]),
         "tumbling": np.array([found.tumbling_fraction]),
         "reverse": np.array([reverse.mean()]),
@@ -43,7 +52,8 @@ def of_cell(path: Path) -> dict[str, np.ndarray]:
 
 
 cells = []
-for path in sorted(options.directory.glob("*/run.h5")):
+first, count = options.members
+for path in sorted(options.directory.glob("*/run.h5"))[first : first + count]:
     try:
         cells.append(of_cell(path.parent))
     except (RecordError, ValueError) as error:
@@ -53,7 +63,7 @@ cells = [cell for cell, length in zip(cells, lengths, strict=True) if length >= 
 values = {name: np.concatenate([cell[name] for cell in cells]) for name in cells[0]}
 print(f"{len(cells)} cells of {lengths.max():g} s; {len(lengths) - len(cells)} that did not reach the end are left out")
 for name, unit in (
-    ("angle", "deg"),
+    *((name, "deg") for name in values if name.startswith("angle")),
     ("tumble", "s"),
     ("run", "s"),
     ("speed", "um/s"),
@@ -65,7 +75,7 @@ for name, unit in (
     own = values[name][np.isfinite(values[name])]
     error = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
     median = np.median(own) if len(own) else np.nan
-    print(f"{name:20s} {own.mean():8.3g} +- {error:<8.2g} median {median:<8.3g} {len(own):4d} values  {unit}")
+    print(f"{name:21s} {own.mean():8.3g} +- {error:<8.2g} median {median:<8.3g} {len(own):4d} values  {unit}")
 
 
 def draw() -> None:
