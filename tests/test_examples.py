@@ -16,7 +16,7 @@ from warpflag.scene import load, with_values
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SCENES = sorted(EXAMPLES.glob("*.toml"))
-SWEEPS = sorted(EXAMPLES.glob("sweeps/*.toml"))
+SWEEPS = sorted([*EXAMPLES.glob("sweeps/*.toml"), *EXAMPLES.glob("behaviour/*.toml")])
 
 
 def few_steps(path: Path, directory: Path) -> Path:
