@@ -11,10 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.helpers import cell, helix_axis
 from warpflag.model.clear_start import clear_start
 from warpflag.model.geometry import ground_state, initial_state, phase_difference_at
 from warpflag.observables import phase_difference, turns_about_axis
+from warpflag.run.simulation import Simulation
 from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, load, paper_scene, with_values
+from warpflag.scene.smooth_helix import inscribed_strain
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 NORMAL = (0.0, 1.3, -2.1)
@@ -54,6 +57,36 @@ def test_ground_state_has_the_known_sizes(segment_length, radius, pitch, rise):
     assert helix.pitch == pytest.approx(pitch, abs=5e-5)
     if rise is not None:
         assert helix.rise == pytest.approx(rise, abs=5e-6)
+
+
+@pytest.mark.parametrize("h", [0.05, 0.2, 0.4])
+@pytest.mark.parametrize("strain", [NORMAL, (0.9, 1.3, -0.6), (0.0, 2.84, 2.29), (0.0, 1.5, 0.0)])
+def test_nodes_lie_on_the_smooth_helix(strain, h):
+    """Radius k/(k^2 + t^2) and pitch 2 pi t/(k^2 + t^2) at any segment length, and the bend's direction as given."""
+    found = inscribed_strain(strain, h)
+    helix = ground_state(found, h)
+    bend, square = math.hypot(*strain[:2]), float(np.dot(strain, strain))
+    assert helix.radius == pytest.approx(bend / square, rel=1e-9)
+    assert helix.rise / helix.angle == pytest.approx(strain[2] / square, rel=1e-9, abs=1e-12)
+    assert found[0] * strain[1] == pytest.approx(found[1] * strain[0], rel=1e-9)
+
+
+def test_a_scene_with_its_nodes_on_the_helix_is_at_rest(device):
+    values = {"flagella.nodes_on_helix": True, "flagella.helix_radius": 0.2, "flagella.helix_pitch": -2.2}
+    scene = cell({**values, "hook.stiffness": 0.65, "motor.axis_angle": 45.0})
+    sim = Simulation(scene, device=device)
+    sim.evaluate()
+    assert sim.state.elastic_energy.sum() < 1e-20
+    axis, point = helix_axis(sim.state.positions[: scene.resolved_flagella()[0].segment_count + 1])
+    away = sim.state.positions[1] - point
+    assert np.linalg.norm(away - (away @ axis) * axis) == pytest.approx(0.2, rel=1e-9)
+
+
+def test_segments_that_span_half_a_turn_are_refused():
+    with pytest.raises(SceneError, match=r"span half a turn.*flagella\.nodes_on_helix"):
+        cell(
+            {"flagella.nodes_on_helix": True, "flagella.segment_length": 1.0, "flagella.intrinsic_curvature": (0, 3, 0)}
+        )
 
 
 def test_ground_state_converges_to_the_continuum_helix_at_second_order():

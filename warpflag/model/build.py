@@ -177,7 +177,7 @@ def build_control(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
 def _rest_strain(group: Flagella, spec: FlagellumSpec) -> np.ndarray:
     """h Omega^0 of the joint after every segment [rad], shape [N + 1, 3]; the hook's and the last segment's unused."""
     h, joints = spec.segment_length, np.zeros((spec.segment_count + 1, 3))
-    joints[1:-1] = h * rest_shape(group.ground_strain, h, spec.segment_count, group.on_axis).strain
+    joints[1:-1] = h * rest_shape(group.strain_at_rest(h), h, spec.segment_count, group.on_axis).strain
     return joints
 
 

@@ -130,7 +130,8 @@ def _phase_shift(scene: Scene) -> float:
 
 def flagellum_at_rest(scene: Scene, spec: FlagellumSpec) -> tuple[Array, Array]:
     """Nodes [um], shape [N + 1, 3], and e1 of segments 1..N, shape [N, 3], on a body at the origin."""
-    rest = rest_shape(scene.flagella.ground_strain, spec.segment_length, spec.segment_count, scene.flagella.on_axis)
+    group, h = scene.flagella, spec.segment_length
+    rest = rest_shape(group.strain_at_rest(h), h, spec.segment_count, group.on_axis)
     axis = np.array(attachment.direction(spec.tilt, spec.azimuth))
     outward = _phase_direction(axis, 0.0 if spec.phase is None else spec.phase)
     # Axes of segment 1: its helix axis onto the wanted one, its outward direction onto the phase's.

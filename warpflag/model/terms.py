@@ -87,7 +87,9 @@ def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: 
 def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
     flagella = [(scene, spec) for scene in scenes for spec in scene.resolved_flagella()]
     rest = [
-        rest_shape(scene.flagella.ground_strain, s.segment_length, s.segment_count, scene.flagella.on_axis)
+        rest_shape(
+            scene.flagella.strain_at_rest(s.segment_length), s.segment_length, s.segment_count, scene.flagella.on_axis
+        )
         for scene, s in flagella
     ]
     limits = [scene.hook.stiffening_torque for scene, _ in flagella]
@@ -108,7 +110,8 @@ def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data:
         for form, name in enumerate((scene.polymorphs.target, scene.polymorphs.second), 1):
             if name == "none":
                 continue
-            strain = spec.segment_length * np.array(getattr(scene.polymorphs, name))
+            strain = scene.flagella.strain_at_rest(spec.segment_length, getattr(scene.polymorphs, name))
+            strain = spec.segment_length * np.array(strain)
             if scene.flagella.ground_strain[2] > 0.0:  # a right-handed filament has the mirror images of all forms
                 strain *= (-1.0, 1.0, -1.0)
             strains[3 * first[k] + form : 3 * first[k + 1] : 3] = strain

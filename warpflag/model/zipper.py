@@ -98,7 +98,9 @@ def measured(record: Record, start: float, stop: float) -> Zipper:
     scene = loads(record.scene_text)
     swimming = recorded.swimming(record, start, stop)
     specs = scene.resolved_flagella()
-    rises = [ground_state(scene.flagella.ground_strain, spec.segment_length).rise for spec in specs]
+    rises = [
+        ground_state(scene.flagella.strain_at_rest(spec.segment_length), spec.segment_length).rise for spec in specs
+    ]
     return Zipper(
         opening_angle=_angle_between_axes(*specs[:2]),
         axial_length=float(np.mean([spec.segment_count * rise for spec, rise in zip(specs, rises, strict=True)])),

@@ -72,7 +72,7 @@ def elastic_energy(
         h, nodes = spec.segment_length, np.asarray(positions[rows], float)
         tangents = np.vstack([axis, segment_tangents(nodes)])
         omega = strain(tangents, directors[rows], h)
-        rest = rest_shape(group.ground_strain, h, spec.segment_count, group.on_axis)
+        rest = rest_shape(group.strain_at_rest(h), h, spec.segment_count, group.on_axis)
         first = np.stack([directors[rows][1], np.cross(tangents[1], directors[rows][1]), tangents[1]], axis=1)
         stiffness = scene.hook.stiffness * (1.0 + abs(spec.torque) / (scene.hook.stiffening_torque or np.inf))
         bent = 2.0 * np.cross(axis, first @ rest.helix_axes[:, 0]) / (1.0 + axis @ first @ rest.helix_axes[:, 0])

@@ -299,7 +299,11 @@ class Scene(Section, key=""):
         if not 2 <= spec.segment_count <= 10_000:
             problem = f"makes {spec.segment_count} of {spec.length:g} um; 2 to 10000 segments are allowed"
             raise SceneError(key, value, problem, lengths)
-        twist = spec.segment_length * abs(self.flagella.ground_strain[2])
+        try:
+            strain = self.flagella.strain_at_rest(spec.segment_length)
+        except ValueError as error:
+            raise SceneError(key, value, f"{error}, with flagella.nodes_on_helix", lengths) from None
+        twist = spec.segment_length * abs(strain[2])
         if twist >= math.pi:
             problem = (
                 f"makes segments of {spec.segment_length:g} um; with flagella.intrinsic_curvature the frame "

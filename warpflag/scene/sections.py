@@ -10,10 +10,10 @@ Body axes: e_b3 is the long axis and points to the rear, e_b1 is where azimuths 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, text, vector
+from warpflag.scene.smooth_helix import inscribed_strain, smooth_strain
 
 FORMS = ("semicoiled", "curly_1", "coiled")
 """Forms of a filament that have names, beside that of its ground state."""
@@ -76,6 +76,7 @@ class Flagella(Section, key="flagella"):
     helix_pitch: float | None = number(
         None, "um", -1e3, 1e3, "of the ground state; negative: left-handed", derived="as intrinsic_curvature says"
     )
+    nodes_on_helix: bool = switch(False, "nodes lie on the smooth helix of that strain; else each joint has the strain")
     filament_radius: float = number(
         0.010, "um", 1e-3, 0.5, "a, not printed but implied by the paper's gamma_R = 4 pi eta a^2"
     )
@@ -88,15 +89,15 @@ class Flagella(Section, key="flagella"):
 
     @property
     def ground_strain(self) -> tuple[float, float, float]:
-        """Strain Omega^0 of the ground state [1/um]: intrinsic_curvature, or that of the helix of radius and pitch.
-
-        A smooth helix of radius R and pitch P has curvature R/w and torsion p/w, w = R^2 + p^2, p = P/(2 pi).
-        """
+        """Strain Omega^0 of the ground state [1/um]: intrinsic_curvature, or that of the helix of radius and pitch."""
         if self.helix_radius is None or self.helix_pitch is None:
             return self.intrinsic_curvature
-        p = self.helix_pitch / (2.0 * math.pi)
-        w = self.helix_radius**2 + p * p
-        return (0.0, self.helix_radius / w, p / w)
+        return smooth_strain(self.helix_radius, self.helix_pitch)
+
+    def strain_at_rest(self, h: float, form: tuple[float, float, float] | None = None) -> tuple[float, float, float]:
+        """Strain of the joints [1/um], segments of h [um]: of the ground state, or of a form of this strain."""
+        strain = self.ground_strain if form is None else form
+        return inscribed_strain(strain, h) if self.nodes_on_helix else strain
 
 
 @dataclass(frozen=True)

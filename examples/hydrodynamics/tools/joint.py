@@ -65,7 +65,7 @@ def tilted(scene: Scene, tilt: tuple[float, float]) -> InitialState:
 def seen_from_flagellum(scene: Scene, m: np.ndarray, tangent: np.ndarray, e1: np.ndarray) -> np.ndarray:
     """Components of the motor axis m across the helix axis, in the flagellum's own axes; of segment 1 given."""
     spec = scene.resolved_flagella()[0]
-    rest = rest_shape(scene.flagella.ground_strain, spec.segment_length, spec.segment_count, True)
+    rest = rest_shape(scene.flagella.strain_at_rest(spec.segment_length), spec.segment_length, spec.segment_count, True)
     return np.array([m @ e1, m @ np.cross(tangent, e1), m @ tangent]) @ rest.helix_axes[:, 1:]
 
 
@@ -175,7 +175,7 @@ def _balance(scene: Scene, start: InitialState) -> tuple[np.ndarray, np.ndarray]
     resistance = motions.T @ np.linalg.solve(_mobility(scene, free, t), motions) + spin_drag * spins.T @ spins
     # The hook: its moment M along both shafts is the motor's torque less the drag of the tripod's spin.
     m, e1 = np.array([0.0, 0.0, 1.0]), start.directors[0][1]
-    rest = rest_shape(scene.flagella.ground_strain, h, spec.segment_count, True).helix_axes[:, 0]
+    rest = rest_shape(scene.flagella.strain_at_rest(h), h, spec.segment_count, True).helix_axes[:, 0]
     axis = rest[0] * e1 + rest[1] * np.cross(t[0], e1) + rest[2] * t[0]
     shaft = (m + t[0]) / (1 + m @ t[0])
     bending = 4 * scene.hook.stiffness / (1 + m @ axis) ** 2 * np.cross(axis, m)

@@ -45,7 +45,7 @@ def turning(scene: Scene, segment_length: float | None = None) -> Turning:
         scene = with_values(scene, {"flagella.segment_length": segment_length, "hydrodynamics.pair_radius": None})
     spec = max(scene.resolved_flagella(), key=lambda own: own.length)
     h = spec.segment_length
-    helix = ground_state(scene.flagella.ground_strain, h)
+    helix = ground_state(scene.flagella.strain_at_rest(h), h)
     turn = helix.angle * (np.arange(spec.segment_count + 1))
     x = np.stack([helix.radius * np.cos(turn), helix.radius * np.sin(turn), helix.rise * np.arange(len(turn))], axis=1)
     mobility = _mobility(scene, spec, x)
