@@ -16,7 +16,7 @@ from warpflag.model.clear_start import clear_start
 from warpflag.model.geometry import ground_state, initial_state, phase_difference_at
 from warpflag.observables import phase_difference, turns_about_axis
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, load, paper_scene, with_values
+from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, attachment, load, paper_scene, with_values
 from warpflag.scene.smooth_helix import inscribed_strain
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
@@ -192,10 +192,12 @@ def test_examples_start_at_the_end_of_the_hook_and_clear_of_contact(path):
     half = (scene.body.length - scene.body.width) / 2
     fractions = np.linspace(0.0, 1.0, 25, endpoint=False)[None, :, None]
     curves = []
-    for nodes in state.positions:
+    for spec, nodes in zip(scene.resolved_flagella(), state.positions, strict=True):
+        stub = nodes[0] - scene.hook.length * np.array(attachment.motor_axis(spec))
+        middle = [0.0, 0.0, np.clip(stub[2], -half, half)]
+        assert abs(np.linalg.norm(stub - middle) - scene.body.width / 2) < 1e-14
         axial = np.clip(nodes[:, 2], -half, half)
         gap = np.linalg.norm(nodes - axial[:, None] * [0, 0, 1], axis=1) - scene.body.width / 2
-        assert abs(gap[0] - scene.hook.length * math.sin(math.radians(scene.motor.axis_angle))) < 1e-15
         if scene.body.contact:
             assert gap[1:].min() > (0.7 * diameter if little_room else 1.3 * cutoff)
         curves.append((nodes[:-1, None] * (1 - fractions) + nodes[1:, None] * fractions).reshape(-1, 3))
