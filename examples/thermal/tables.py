@@ -21,6 +21,7 @@ TABLES: dict[str, Callable[[float], None]] = {
         joints.energies,
         joints.order,
         joints.lengths,
+        joints.dumbbell,
         joints.persistence,
         motion.drift,
         motion.diffusion,

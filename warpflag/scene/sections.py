@@ -257,7 +257,7 @@ class Fluid(Section, key="fluid"):
         1e-6,
         0.1,
         "relative error of the random flows of the pair sum",
-        derived="what five products with it leave, 1e-4 to 3e-3",
+        derived="what five products with it leave, 5e-5 to 6e-3",
     )
 
 

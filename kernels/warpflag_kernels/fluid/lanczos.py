@@ -4,7 +4,7 @@ With V the orthonormal basis of the Krylov space of R and z, T the tridiagonal m
 
     R^1/2 z = |z| V T^1/2 e_1        (Ando, Chow, Saad & Skolnick, J. Chem. Phys. 137, 064106 (2012)).
 
-R is well conditioned (4 to 13 for two flagella, apart or bundled), so five products err by 1e-4 to 3e-3. A cell may ask
+R is well conditioned (4 to 13 for two flagella, apart or bundled), so five products err by 5e-5 to 6e-3. A cell may ask
 for a tolerance instead: products go on until the last one has changed the result by less, relative to its length. T^1/2
 comes from the eigenvalues of T, by Jacobi's rotations; a thread does the sums of a cell.
 """
