@@ -73,6 +73,8 @@ for name, unit in (
     ("bundled in reverse", "l_r"),
 ):
     own = values[name][np.isfinite(values[name])]
+    if not len(own):
+        continue
     error = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
     median = np.median(own) if len(own) else np.nan
     print(f"{name:21s} {own.mean():8.3g} +- {error:<8.2g} median {median:<8.3g} {len(own):4d} values  {unit}")
