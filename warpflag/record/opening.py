@@ -54,18 +54,28 @@ class Contents:
     sums: dict[str, NDArray[np.uint32]]
 
 
-def read_contents(path: Path) -> Contents:
+def read_contents(path: Path, stays_open: bool = False) -> tuple[Contents, Any]:
     """Looks into a record, also into one that a run is writing: then once more where a block was written meanwhile.
+
+    Returns:
+        what it holds, and the file of h5py, if it is to stay open, or None.
 
     Raises:
         RecordError: the file is damaged, or no record of this program.
     """
     for attempt in range(_ATTEMPTS):
         before = _state(path)
+        file = None
         try:
-            with open_file(path) as file:
-                return _checked(path, file)
+            file = open_file(path)
+            contents = _checked(path, file)
+            if stays_open:
+                return contents, file
+            file.close()
+            return contents, None
         except RecordError:
+            if file is not None:
+                file.close()
             time.sleep(_SECONDS_BETWEEN)
             if attempt + 1 == _ATTEMPTS or _state(path) == before:
                 raise

@@ -98,7 +98,10 @@ class Record:
 
     @cached_property
     def _contents(self) -> Contents:
-        return read_contents(self.path)
+        contents, file = read_contents(self.path, self._stays_open)
+        if file is not None:
+            self._file = file
+        return contents
 
     @property
     def entries(self) -> tuple[str, ...]:

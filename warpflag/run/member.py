@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import json
 import os
 import shutil
@@ -82,6 +83,10 @@ class Member:
         """Time that the run has taken, that before it was resumed included [s]."""
         return monotonic() - self._began
 
+    @functools.cached_property
+    def _settings_sha256(self) -> str:
+        return settings_sha256(self.scene)
+
     def start(self, first_node: np.ndarray) -> None:
         """Opens the record; flagellum k has the nodes first_node[k] to first_node[k + 1] - 1."""
         start_reporter(self.recorder, self.scene, first_node)
@@ -113,7 +118,7 @@ class Member:
             "time": time,
             "wall_time": self.wall_time,
             "device": device,
-            "settings_sha256": settings_sha256(self.scene),
+            "settings_sha256": self._settings_sha256,
             "versions": versions(),
         }
         self.recorder.flush()
