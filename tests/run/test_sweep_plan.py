@@ -11,7 +11,7 @@ import pytest
 from tests.runs import small
 from warpflag.model.geometry import initial_state
 from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, start
-from warpflag.scene import SceneError, dumps, load
+from warpflag.scene import SceneError, dumps, load, with_values
 
 
 @pytest.fixture
@@ -167,7 +167,8 @@ def test_all_bad_members_are_named_before_anything_starts(folder, monkeypatch):
     lines = str(refused.value).splitlines()
     assert len(lines) == 2 and "member 0001: motor.torque = 5000.0" in lines[0] and "member 0003" in lines[1]
     # Whether a shape begins inside the body is known only once it is made.
-    deep = Sweep(load("base.toml"), {"flagella.opening_angle": [90.0, 0.0], "flagella.anchor_offset": [0.6, -1.2]})
+    alone = with_values(load("base.toml"), {"flagella.count": 1})
+    deep = Sweep(alone, {"flagellum.0.tilt": [45.0, 180.0], "flagella.anchor_offset": [0.6, 1.25]})
     with pytest.raises(BadMembers, match="inside the body") as refused:
         start(deep)
     assert not (folder / "runs").exists()
