@@ -14,7 +14,6 @@ import numpy as np
 from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.contact import search
 from warpflag_kernels.implicit import collocation, contact_solve, step_flow
-from warpflag_kernels.stepping import step_control
 
 from tests.bench import Bench, dense_solver, flat
 from tests.helpers import shaken, touching_cell
@@ -29,8 +28,8 @@ FINE = contact_solve.FINEST * SIGMA
 
 
 def controlled(step: float) -> float:
-    """Tolerance of a gap in a step at the usual accuracy [um]."""
-    return collocation.GAP_SHARE * DEFAULT_ACCURACY * 1e3 * float(np.sqrt(step * step_control.SPAN))
+    """Tolerance of a gap in a step of more than 2 us at the usual accuracy [um]."""
+    return collocation.GAP_SHARE * DEFAULT_ACCURACY * float(np.sqrt(step / 1e-3))
 
 
 CROWD = {"flagella.count": 3, "flagellum.2.azimuth": 357.0, "flagellum.1.length": 1.2, "flagella.opening_angle": 90.0}

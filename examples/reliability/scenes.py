@@ -129,12 +129,11 @@ def asked(scene: Scene, time: float) -> float:
 def told(scene: Scene, sim: Simulation, states: list[CellState]) -> str:
     """What the run itself says of an error beyond what was asked; empty where it says nothing."""
     kept = accuracy_kept(scene, sim.checkpoint())
-    estimate = (kept["estimate"] or 0.0) / kept["asked"]
+    estimate, worst = ((kept[name] or 0.0) / kept["asked"] for name in ("estimate", "worst_window"))
     if scene.numerics.time_step and estimate > BEYOND:
         return f"fixed steps, whose estimate is {estimate:.3g} times"
-    if estimate > SUSPECT and (found := growth(scene, states, sim.first_node, "cpu")):
-        return growth_words(found)
-    return ""
+    step = 0.5 * float(sim.times[0] / sim.steps[0])
+    return growth_words(growth(scene, states, sim.first_node, "cpu", step)) if worst > SUSPECT else ""
 
 
 def against_finer(
@@ -155,7 +154,7 @@ def against_finer(
     """
     cut_off = cut_off or CUT_OFF
     seen, seconds, end, sim = looks(scene, start, cut_off)
-    states = seen[:: LOOKS // 2]
+    states = seen[:: LOOKS // 3][::-1]
     if end and end != "cut off" and not seen:
         return found("stopped", end, seconds=seconds)
     accuracy = scene.numerics.asked / FINER

@@ -5,51 +5,123 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.runs import small, summary
 from warpflag.run import execute, run
-from warpflag.run.growth import States, growth, growth_words
+from warpflag.run.growth import SPAN, Growth, chosen, growth, growth_words
 from warpflag.run.simulation import Simulation
+from warpflag.run.stop import Ended
+from warpflag.scene import paper_scene, with_values
 
 
-def test_states_are_spread_over_a_run():
-    for count, expected in ((1, [0]), (2, [0, 1]), (9, [0, 4, 8]), (40, [0, 16, 32])):
-        states = States()
-        for k in range(count):
-            state: Any = SimpleNamespace(time=float(k))
-            states.add(state)
-        chosen = [state.time for state in states.chosen()]
-        assert chosen[0] == 0.0 and chosen[-1] <= count - 1
-        assert chosen == pytest.approx(expected, abs=max(1, count // 5)), count
-    assert States().chosen() == []
+def test_a_run_is_followed_from_frames_spread_over_it():
+    record: Any = SimpleNamespace(times=np.linspace(0.0, 4e-3, 41), frame_count=41, frame=lambda index: index)
+    assert list(chosen(record, None)) == [0, 40, 20]
+    assert list(chosen(record, 3.31e-3)) == [32, 40, 0, 20]  # the frame before the window of 0.1 ms
+    record.times, record.frame_count = np.zeros(1), 1
+    assert list(chosen(record, 1e-3)) == [0]
 
 
 def test_a_steady_motion_magnifies_little_and_an_unstable_one_is_told():
     scene = small({"duration": 2e-4})
     simulation = Simulation(scene, device="cpu")
     simulation.advance(2e-5)
-    factor, time = growth(scene, [simulation.cell_state()], simulation.first_node, "cpu")
-    assert 0.01 < factor < 20.0 and time == simulation.times[0]
-    assert growth_words((factor, time)) == "" == growth_words(None)
-    assert "grows 4.2e+03 times in 0.1 ms from 0.3 ms on" in growth_words((4200.0, 3e-4))
+    found = growth(scene, [simulation.cell_state()], simulation.first_node, "cpu", 1e-6)
+    assert found is not None and 0.01 < found.factor < 20.0 and found.start == simulation.times[0]
+    assert 1e-5 <= found.within <= SPAN and not found.unstable
+    assert growth_words(found) == "" == growth_words(None)
+    assert "grows 4.2e+03 times in 0.05 ms from 0.3 ms on" in growth_words(Growth(4200.0, 3e-4, 5e-5))
+    assert growth(scene, [simulation.cell_state()], simulation.first_node, "cpu", 1e-6, patience=0.0) is None
+
+
+PRESSED = {
+    "flagella.count": 2,
+    "flagella.segment_length": 0.1,
+    "flagella.phase_difference": None,
+    "body.contact": False,
+    "body.length": 2.585,
+    "body.width": 1.066,
+    "motor.torque": -2.639,
+    "motor.axis_angle": 26.43,
+    "fluid.viscosity": 4.37e-4,
+    "flagella.bending_rigidity": 2.558,
+    "flagella.twist_rigidity": 1.423,
+    "flagella.opening_angle": 125.2,
+    "flagellum.0.azimuth": 4.03,
+    "flagellum.0.anchor_offset": 0.318,
+    "flagellum.0.length": 5.767,
+    "flagellum.0.torque": 0.385,
+    "flagellum.1.azimuth": 182.75,
+    "flagellum.1.anchor_offset": -0.305,
+    "flagellum.1.length": 2.97,
+    "flagellum.1.torque": -5.438,
+    "flagellum.1.tilt": 44.2,
+    "flagellum.1.phase": -24.74,
+}
+"""A flagellum is wound up by a motor that is too strong for it: it loops and falls over."""
+
+
+def test_errors_of_steps_are_no_growth():
+    """With steps under control the pair would differ by hundreds of times the disturbance, the errors of its steps."""
+    scene = with_values(paper_scene("pressed"), {**PRESSED, "duration": 1.0e-4})
+    simulation = Simulation(scene, device="cpu")
+    simulation.advance(5e-5)
+    found = growth(scene, [simulation.cell_state()], simulation.first_node, "cpu", 5e-8)
+    assert found is not None and 0.1 < found.factor < 5.0
+
+
+def test_growth_at_a_known_rate_is_found(monkeypatch):
+    """Two cells that part at a rate that doubles their distance ten times in `SPAN`; looks are a tenth of it apart."""
+    made = []
+
+    class Parting:
+        def __init__(self, scenes, device, starts):
+            made.append(scenes)
+            self.one, self.two = (np.concatenate(start.positions) for start in starts)
+
+        def advance(self, until, watch):
+            watch()
+            self.scale = 2.0 ** (10.0 * until / SPAN)
+
+        def cells(self):
+            return SimpleNamespace(positions=np.concatenate([self.one, self.one + self.scale * (self.two - self.one)]))
+
+    monkeypatch.setattr("warpflag.run.growth.Simulation", Parting)
+    scene = small({"numerics.accuracy": 1e-3})
+    nodes = np.zeros((22, 3))
+    state = SimpleNamespace(time=3e-4, positions=nodes, directors=nodes, body_position=nodes[0], body_orientation=None)
+    found = growth(scene, [state], np.array([0, 11, 22]), "cpu", 2e-7)
+    largest = np.linalg.norm(np.random.default_rng(0).standard_normal((10, 3)), axis=1).max() / 3**0.5
+    assert found is not None and found.unstable and found.start == 3e-4
+    assert found.factor > largest * 2.0 ** (10.0 * found.within / SPAN) * (1 - 1e-9)
+    assert found.within == pytest.approx(SPAN * 0.6) or found.within == pytest.approx(SPAN * 0.7)
+    assert all(own.numerics.time_step == 2e-7 and own.numerics.accuracy is None for own in made[0])
+
+    def stop():
+        raise Ended("interrupted", "")
+
+    assert growth(scene, [state], np.array([0, 11, 22]), "cpu", 2e-7, check=stop) is None
 
 
 def test_a_run_is_followed_where_its_estimate_is_high(tmp_path, monkeypatch):
     asked = []
 
-    def found(scene, states, first_node, device):
-        asked.append((scene.name, len(states), list(first_node), device))
-        return 5e3, 1e-5
+    def found(scene, states, first_node, device, step, patience, check):
+        assert 1e-9 < step < 1e-5
+        asked.append((scene.name, [state.time for state in states], list(first_node), device))
+        return Growth(5e3, 1e-5, 2e-5)
 
     monkeypatch.setattr(execute, "growth", found)
     for share, name in ((1e-9, "sound"), (1.0, "high")):
         started = run.start(small({"numerics.on_accuracy": "warn"}), str(tmp_path / name), "cpu")
         achieved = started.simulation.stepper.steps.achieved
-        achieved.total.fill_(share)  # [s], of some ten microseconds
+        achieved.window_time.fill_(-1.0)  # no window of the run itself comes to an end
+        achieved.worst.fill_(1e3 * share)
         message = started.execute(quiet=True).message
         assert ("unstable motion: a disturbance grows 5e+03 times" in message) == (name == "high")
-        expected = {"factor": 5e3, "from": 1e-5} if name == "high" else None
+        expected = {"factor": 5e3, "from": 1e-5, "within": 2e-5} if name == "high" else None
         assert summary(tmp_path / name)["growth"] == expected
     assert [(name, nodes, device) for name, _, nodes, device in asked] == [("small", [0, 11, 22], "cpu")]
-    assert asked[0][1] >= 1
+    assert asked[0][1][-1] > 0.0 in asked[0][1]

@@ -67,7 +67,11 @@ def test_the_device_adds_up_the_estimates_of_accepted_steps(stepper, device):
     counted = times >= accuracy.BEGIN * SHORTEST_STEP
     times, lengths, errors = times[counted], lengths[counted], errors[counted]
     assert 5 < counted.sum() < len(counted)
-    shares = (errors / (1e-3 * (lengths / 1e-3) ** power)) ** (1 / power)
+    allowed = 1e-3 * (lengths / 1e-3) ** power
+    if stepper == "implicit":  # within 2 us errors add up with equal sign
+        assert (lengths < 1e-6).any() and (lengths > 2e-6).any()
+        allowed *= np.minimum(1.0, np.sqrt(lengths / 2e-6))
+    shares = (errors / allowed) ** (1 / power)
     achieved = {name: float(getattr(steps.achieved, name).numpy()[0]) for name in accuracy.SUMS}
     assert achieved["total"] == pytest.approx((lengths * shares).sum(), rel=TOLERANCE)
     assert achieved["total_time"] == pytest.approx(lengths.sum(), rel=TOLERANCE)

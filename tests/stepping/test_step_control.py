@@ -70,11 +70,11 @@ def test_switch_on_itself_is_accurate(stepper, device, precision):
 
 def test_every_attempt_is_a_step_or_a_rejected_one(device, precision):
     sim = advanced(touching_cell(implicit(accuracy=5e-3), precision), None, 2e-6, device)
-    assert counts(sim)[1] == 0
+    before = counts(sim)[1]
     sim.stepper.steps.wanted_step.fill_(1e-5)  # far too long, so soon
     sim.advance(3e-5)
     taken, rejected, evaluations = counts(sim)
-    assert rejected > 0
+    assert rejected > before
     assert evaluations == taken + rejected
 
 

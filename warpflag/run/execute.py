@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from time import monotonic
+from time import monotonic, process_time
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,14 @@ from warpflag_kernels.stepping.health import Fault
 from warpflag.base.device import compiled_modules, kernel_folder
 from warpflag.base.progress import Progress
 from warpflag.base.streams import say
-from warpflag.record import Frame, RecordError
+from warpflag.record import Frame, Record, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
-from warpflag.run.growth import States, growth
+from warpflag.run.growth import PATIENCE, Growth, chosen, growth
 from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.summary import accuracy_kept
-from warpflag.scene import Scene
 
 __all__ = ["SUSPECT", "Run"]
 
@@ -33,7 +32,7 @@ _CHECKPOINT_SECONDS = 5.0
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05
 _WRITERS = 8
-SUSPECT = 2.0  # estimate over the accuracy from which the motion is looked at
+SUSPECT = 1.0  # estimate of the worst window over the accuracy from which the motion is looked at
 _SECONDS_BEFORE_EXPLAINING = 2.0
 
 
@@ -60,7 +59,8 @@ class Run:
         # The last copy of all cells after a block of frames, and when it was taken: what a checkpoint is written from.
         self._copy: dict[str, np.ndarray] = {}
         self._copied_at = -math.inf
-        self._states = States()
+        self._following = 0.0  # computing time that has gone into following disturbances [s]
+        self._check: Callable[[], None] = lambda: None
 
     @property
     def simulation(self) -> Simulation:
@@ -110,6 +110,7 @@ class Run:
         for member, notes in zip(self.members, self.simulation.notes, strict=True):
             for note in () if quiet else notes:
                 print(f"warpflag: {member.scene.name}: {note}", file=sys.stderr)
+        self._check = stop.check
         try:
             stop.check()
             self._prepare(quiet, stop)
@@ -154,8 +155,6 @@ class Run:
             faults = {c: e for c, e in self.simulation.faults.items() if self.members[c].outcome is None}
             if at_end or faults or monotonic() - self._copied_at > min(_SECONDS_PER_COPY, interval):
                 self._copy, self._copied_at = self.simulation.checkpoint(), monotonic()
-                if len(self.members) == 1 and not faults:
-                    self._states.add(self.simulation.cell_state())
             self._complete(sorted(at_end))
             self._stop(faults)
             if monotonic() - saved > interval:
@@ -193,23 +192,30 @@ class Run:
         self._save(cells)
         for cell in cells:
             facts, scene = self._facts(cell), self.members[cell].scene
-            self._follow(facts, scene)
             fault = None
             if facts["accuracy"]["beyond"] and scene.numerics.on_accuracy == "stop" and not scene.numerics.time_step:
                 fault = NumericalError(Fault.ACCURACY, float(self._copied_times()[cell]), cell, 0, 0, scene)
-                facts = self._facts(cell, fault) | {"growth": facts["growth"]}
-            status = "stopped" if fault else "done"
-            finish = functools.partial(self.members[cell].finish, status, facts, fault, movie=self.movies)
-            self._guarded(cell, finish)
+                facts = self._facts(cell, fault)
+            self._finish(cell, "stopped" if fault else "done", facts, fault)
 
-    def _follow(self, facts: dict[str, Any], scene: Scene, stopped: bool = False) -> None:
-        """Whether the motion itself is unstable, where estimates are high or a guard has stopped the run."""
-        kept, found = facts["accuracy"], None
-        high = kept["estimate"] is not None and kept["estimate"] > SUSPECT * kept["asked"]
-        if len(self.members) == 1 and (high or stopped):
-            first_node = self._first_node(0)
-            found = growth(scene, self._states.chosen(), first_node, self.simulation.device.alias)
-        facts["growth"] = {"factor": found[0], "from": found[1]} if found else None
+    def _finish(self, cell: int, status: str, facts: Mapping[str, Any], fault: NumericalError | None) -> None:
+        """Ends a member, whose motion is looked at where its estimates are high or a guard has stopped it."""
+        member, kept = self.members[cell], facts["accuracy"]
+        high = kept["worst_window"] is not None and kept["worst_window"] > SUSPECT * kept["asked"]
+
+        def follow(record: Record) -> Growth | None:
+            # Members of a batch share the time that one run may take.
+            patience = PATIENCE - self._following
+            if not (high or fault) or patience <= 0.0:
+                return None
+            began, device = process_time(), self.simulation.device.alias
+            frames = chosen(record, kept["worst_window_end"])
+            step = 0.5 * self._copied_times()[cell] / max(int(facts["steps"]), 1)
+            found = growth(member.scene, frames, record.first_node, device, step, patience, self._check)
+            self._following += process_time() - began
+            return found
+
+        self._guarded(cell, functools.partial(member.finish, status, facts, fault, movie=self.movies, follow=follow))
 
     def _copied_times(self) -> np.ndarray:
         """Time of every cell at the last copy [s], shape [cell_count]."""
@@ -232,10 +238,7 @@ class Run:
     def _stop(self, faults: Mapping[int, NumericalError]) -> None:
         """Ends the members whose cells have violated a guard."""
         for c, fault in faults.items():
-            member = self.members[c]
-            facts = self._facts(c, fault)
-            self._follow(facts, member.scene, stopped=True)
-            self._guarded(c, functools.partial(member.finish, "stopped", facts, fault, movie=self.movies))
+            self._finish(c, "stopped", self._facts(c, fault), fault)
 
     def _end(self, ended: Ended) -> None:
         """Ends every member that still goes on, with a checkpoint to resume from."""

@@ -1,105 +1,161 @@
 """Whether a motion magnifies disturbances: two copies of a cell, one of them disturbed, for a tenth of a millisecond.
 
-No step control keeps a promise per millisecond where neighbouring trajectories part: flagella pressed together buckle
-this way or that. An error estimate knows what a step adds, not what becomes of it. So a run whose estimates are high,
-or that a guard has stopped, is followed from some of its states by a pair of cells, to tell such a motion from a
-stepper that fails.
+No step control keeps a promise per millisecond where neighbouring trajectories part. An error estimate knows what a
+step adds, not what becomes of it. So a run whose estimates are high, or that a guard has stopped, is followed from some
+of its frames by a pair of cells, to tell such a motion from a stepper that fails. Both take the same fixed steps: steps
+under control would differ, and so would the errors that they make, by far more than the disturbance.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from warpflag.model.geometry import InitialState
-from warpflag.record.cell_state import CellState
+from warpflag.record import Record
+from warpflag.record.reporters import Frame
 from warpflag.run.faults import NumericalError
 from warpflag.run.simulation import Simulation
+from warpflag.run.stop import Ended
 from warpflag.scene import Scene, SceneError, with_values
 
-__all__ = ["SPAN", "UNSTABLE", "States", "growth", "growth_words"]
+__all__ = ["PATIENCE", "SPAN", "UNSTABLE", "Growth", "State", "chosen", "growth", "growth_words"]
 
 SPAN = 1.0e-4
 """Simulated time for which a disturbance is followed [s]."""
 UNSTABLE = 100.0
 """Growth in that time from which a motion is called unstable; that of a bundle that zips is below ten."""
-_DISTURBANCE = 1.0e-6  # um, far above round-off and far below what an accuracy asks for
-_LOOKS = 5
-_KEPT = 8
-_FOLLOWED = 3
+PATIENCE = 20.0
+"""Computing time that may go into following a run [s]."""
+_DISTURBANCE = {"float64": 1.0e-6, "float32": 1.0e-4}  # um, above round-off and far below contact distances
+_LOOKS = 10
 
 
-class States:
-    """Some states of a run in which it may be looked at again, spread over its time."""
+@dataclass(frozen=True)
+class Growth:
+    """How a disturbance has grown.
 
-    def __init__(self) -> None:
-        self._kept: list[CellState] = []
-        self._stride, self._seen = 1, 0
+    Attributes:
+        factor: largest displacement of a node over the disturbance.
+        start: simulated time from which it was followed [s].
+        within: time that it took [s].
+    """
 
-    def add(self, state: CellState) -> None:
-        """Offers a state; every second of those kept is dropped when they are too many."""
-        if self._seen % self._stride == 0:
-            self._kept.append(state)
-        self._seen += 1
-        if len(self._kept) > _KEPT:
-            self._kept, self._stride = self._kept[::2], 2 * self._stride
+    factor: float
+    start: float
+    within: float
 
-    def chosen(self) -> list[CellState]:
-        """The first, one from the middle, and the last."""
-        picked = np.unique(np.linspace(0, len(self._kept) - 1, _FOLLOWED).round().astype(int))
-        return [self._kept[i] for i in picked] if self._kept else []
+    @property
+    def unstable(self) -> bool:
+        """Whether no step keeps an error small in such a motion."""
+        return self.factor >= UNSTABLE
+
+
+class State(Protocol):
+    """What a pair of cells starts from: a `CellState` or a `Frame`."""
+
+    @property
+    def time(self) -> float: ...
+    @property
+    def positions(self) -> np.ndarray: ...
+    @property
+    def directors(self) -> np.ndarray: ...
+    @property
+    def body_position(self) -> np.ndarray: ...
+    @property
+    def body_orientation(self) -> np.ndarray: ...
+
+
+def chosen(record: Record, worst_end: float | None) -> Iterable[Frame]:
+    """Frames to follow a run from: before its worst estimates, the last, the first, and one from the middle.
+
+    Args:
+        record: of the run.
+        worst_end: end of the window with its worst estimate [s]; None: there is none.
+    """
+    last = record.frame_count - 1
+    begin = np.searchsorted(record.times, (worst_end or 0.0) - SPAN, side="right") - 1
+    for index in dict.fromkeys((max(int(begin), 0), last, 0, last // 2)):
+        yield record.frame(index)
 
 
 def growth(
-    scene: Scene, states: Sequence[CellState], first_node: np.ndarray, device: str
-) -> tuple[float, float] | None:
-    """The largest growth of a disturbance within `SPAN` of one of some states, and the time of that state [s].
+    scene: Scene,
+    states: Iterable[State],
+    first_node: np.ndarray,
+    device: str,
+    step: float,
+    patience: float = PATIENCE,
+    check: Callable[[], None] = lambda: None,
+) -> Growth | None:
+    """The largest growth of a disturbance within `SPAN` of one of some states, or the first that is unstable.
 
     Args:
         scene: of the cell.
         states: to start from.
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1.
         device: to compute on.
+        step: of the pair [s]; that of the run, or less.
+        patience: computing time after which no further look is taken [s].
+        check: called a few times a second; where it raises Ended, no further look is taken.
 
     Returns:
         None where no state could be followed.
     """
-    found: list[tuple[float, float]] = []
-    followed = with_values(scene, {"numerics.on_accuracy": "warn"})
-    for state in states:
-        start = InitialState(
-            tuple(np.split(state.positions, first_node[1:-1])),
-            tuple(np.split(state.directors, first_node[1:-1])),
-            state.body_position,
-            state.body_orientation,
-        )
-        noise = np.random.default_rng(0)
-        moved = []
-        for nodes in start.positions:
-            other = nodes.copy()
-            other[1:] += _DISTURBANCE / 3**0.5 * noise.standard_normal(other[1:].shape)
-            moved.append(other)
-        largest = 0.0
-        try:
-            pair = Simulation(
-                [followed, followed], device=device, starts=[start, dataclasses.replace(start, positions=tuple(moved))]
-            )
-            for k in range(_LOOKS):
-                pair.advance(SPAN * (k + 1) / _LOOKS)
-                one, two = np.split(pair.cells().positions, 2)
-                largest = max(largest, float(np.linalg.norm(one - two, axis=1).max()) / _DISTURBANCE)
-        except (NumericalError, SceneError):
-            pass
-        if largest > 0.0:
-            found.append((largest, state.time))
-    return max(found, default=None)
+    found: list[Growth] = []
+    until = time.process_time() + patience
+
+    def watch() -> None:
+        check()
+        if time.process_time() > until:
+            raise Ended("late", "")
+
+    with contextlib.suppress(Ended):
+        for state in states:
+            watch()
+            for own in _looks(scene, state, first_node, device, step, watch):
+                found.append(own)
+                if own.unstable:
+                    return own
+    return max(found, key=lambda own: own.factor, default=None)
 
 
-def growth_words(found: tuple[float, float] | None) -> str:
+def _looks(
+    scene: Scene, state: State, first_node: np.ndarray, device: str, step: float, watch: Callable[[], None]
+) -> Iterator[Growth]:
+    """The growth from one state at `_LOOKS` times, until a guard stops the pair or `watch` raises."""
+    size = _DISTURBANCE[scene.numerics.precision]
+    start = InitialState(
+        tuple(np.split(state.positions, first_node[1:-1])),
+        tuple(np.split(state.directors, first_node[1:-1])),
+        state.body_position,
+        state.body_orientation,
+    )
+    noise = np.random.default_rng(0)
+    moved = [nodes.copy() for nodes in start.positions]
+    for nodes in moved:
+        nodes[1:] += size / 3**0.5 * noise.standard_normal(nodes[1:].shape)
+    with contextlib.suppress(NumericalError, SceneError):
+        steps = {"numerics.time_step": scene.numerics.time_step or step, "numerics.accuracy": None}
+        followed = with_values(scene, {"numerics.on_accuracy": "warn", **steps})
+        starts = [start, dataclasses.replace(start, positions=tuple(moved))]
+        pair = Simulation([followed, followed], device=device, starts=starts)
+        for k in range(_LOOKS):
+            within = SPAN * (k + 1) / _LOOKS
+            pair.advance(within, watch)
+            one, two = np.split(pair.cells().positions, 2)
+            yield Growth(float(np.linalg.norm(one - two, axis=1).max()) / size, state.time, within)
+
+
+def growth_words(found: Growth | None) -> str:
     """What `growth` found, for the last line of a run; empty where the motion is no more than lively."""
-    if found is None or found[0] < UNSTABLE:
+    if found is None or not found.unstable:
         return ""
-    when = f"in {1e3 * SPAN:g} ms from {1e3 * found[1]:.4g} ms on"
-    return f"unstable motion: a disturbance grows {found[0]:.2g} times {when}, so that no step keeps an error small"
+    when = f"in {1e3 * found.within:g} ms from {1e3 * found.start:.4g} ms on"
+    return f"unstable motion: a disturbance grows {found.factor:.2g} times {when}, so that no step keeps an error small"

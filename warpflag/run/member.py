@@ -8,7 +8,7 @@ import functools
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -21,7 +21,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter, versions
 from warpflag.run import checkpoint
 from warpflag.run.faults import NumericalError
-from warpflag.run.growth import growth_words
+from warpflag.run.growth import Growth, growth_words
 from warpflag.run.lock import Lock
 from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, settings_sha256, write_whole
 from warpflag.run.stop import Ended
@@ -132,6 +132,7 @@ class Member:
         fault: NumericalError | None = None,
         ended: Ended | None = None,
         movie: bool = True,
+        follow: Callable[[Record], Growth | None] = lambda record: None,
     ) -> None:
         """Closes the record and writes summary and movie.
 
@@ -141,10 +142,11 @@ class Member:
             fault: the guard that was violated.
             ended: what ended the run before its time.
             movie: whether the movie is wanted; a run that will be resumed gets none.
+            follow: what tells from the record how the motion magnifies disturbances.
         """
         try:
             self.recorder.close()
-            message = self._written(status, facts, fault, ended, movie)
+            message = self._written(status, facts, fault, ended, movie, follow)
         finally:
             self._lock.release()
         self.outcome = Outcome(status, f"{self.scene.name}: {message}")
@@ -166,6 +168,7 @@ class Member:
         fault: NumericalError | None,
         ended: Ended | None,
         movie: bool,
+        follow: Callable[[Record], Growth | None],
     ) -> str:
         """Summary and movie of the record; returns what the user is told."""
         how = status + (f" ({ended.reason})" if ended and ended.reason else "")
@@ -174,18 +177,17 @@ class Member:
                 return f"{how} before a new frame, those of before are kept; resumable with --resume {self.directory}"
             return f"{how} before the first frame; start again with --resume {self.directory}"
         with Record(self.directory) as record:
-            found, taken = digest(record, self.scene), self.wall_time
+            found, grown, taken = digest(record, self.scene), follow(record), self.wall_time
+            growth = {"factor": grown.factor, "from": grown.start, "within": grown.within} if grown else None
             ending = {"status": status, "message": str(fault) if fault else "", "wall_time": taken}
-            summary = {**ending, **facts, **found}
+            summary = {**ending, **facts, "growth": growth, **found}
             write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
             left_out = "" if not movie or ended is None else "; movie left out"
             if movie and ended is None:
                 left_out = _movie(record, self.directory / MOVIE_NAME)
         count = found["frames"]
         reached = f"{count} frame{'s' if count > 1 else ''} to {found['time'] * 1e3:.6g} ms"
-        grown = facts["growth"]
-        grown = growth_words((grown["factor"], grown["from"])) if grown else ""
-        kept = "; ".join(filter(None, (kept_words(facts["accuracy"]), grown)))
+        kept = "; ".join(filter(None, (kept_words(facts["accuracy"]), growth_words(grown))))
         if status == "done":
             said = f", {kept}" if kept else ""
             return f"{reached} in {taken:.1f} s{said}: {self.directory}{left_out}"

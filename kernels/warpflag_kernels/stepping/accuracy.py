@@ -1,7 +1,8 @@
 """What accuracy a run has kept: the error estimates of its steps added up on the device, per cell.
 
-A step of dt may err by what `step_control` says, which grows as dt^p, p = 1 for errors of equal sign and 1/2 for
-independent ones. With r the estimate over that, the errors of steps add up to the share
+A step of dt may err by `may_make`, which grows as dt^p, p = 1 for errors of equal sign and 1/2 for independent ones.
+Independent are errors that lie farther apart than `CORRELATION`: within that time steps err alike, so shorter ones may
+err in proportion to dt. With r the estimate over what a step may make, the errors of steps add up to the share
 
     [sum of dt r^(1/p) / time]^p
 
@@ -19,6 +20,7 @@ import numpy as np
 import warp as wp
 
 SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
+CORRELATION = 2.0e-6  # time within which errors of steps have equal sign where they are otherwise independent [s]
 WINDOW = 1.0e-4  # time over which the worst estimate is taken [s]: some ten steps and more
 # Steps of the shortest length that are not counted after the start of a scene, 1 us in water: what the start leaves
 # stretched and pressed relaxes then, and estimates see that as error.
@@ -66,12 +68,33 @@ def allocate(accuracies: Sequence[float], stopping: Sequence[bool], device: Any)
 
 @functools.cache
 def functions(independent: bool) -> SimpleNamespace:
-    """Device function `add` for errors that are independent from step to step, or of equal sign."""
+    """Device functions of errors that are independent from step to step, or of equal sign.
+
+    `may_make` is the error that a step may make, `longest` the step whose estimate level dt^3 is that, `add` counts an
+    estimate.
+    """
     name = "independent" if independent else "systematic"
     module = wp.get_module(f"warpflag_kernels.accuracy_{name}")
     exponent = 0.5 if independent else 1.0
     scale, power = wp.constant(wp.float64(SPAN ** (1.0 - exponent))), wp.constant(wp.float64(exponent))
+    root, alike = wp.constant(wp.float64(1.0 / (3.0 - exponent))), wp.constant(wp.float64((SPAN / CORRELATION) ** 0.5))
     span, window, begin = (wp.constant(wp.float64(x)) for x in (SPAN, WINDOW, BEGIN))
+
+    @wp.func(module=module)
+    def may_make(rate: wp.float64, dt: wp.float64):
+        """Error that a step may make where `rate` [um/s] is asked for [um]."""
+        most = rate * scale * wp.pow(dt, power)
+        if wp.static(independent):
+            most = wp.min(most, rate * alike * dt)
+        return most
+
+    @wp.func(module=module)
+    def longest(rate: wp.float64, level: wp.float64):
+        """Step whose error, level dt^3 [um], is what it may make at this rate [s]."""
+        dt = wp.pow(rate * scale / level, root)
+        if wp.static(independent):
+            dt = wp.min(dt, wp.sqrt(rate * alike / level))
+        return dt
 
     @wp.func(module=module)
     def add(a: Achieved, c: wp.int32, dt: wp.float64, error: wp.float64, time: wp.float64, shortest: wp.float64):
@@ -84,7 +107,7 @@ def functions(independent: bool) -> SimpleNamespace:
         zero = wp.float64(0.0)
         if time < begin * shortest:
             return False
-        share = error / (a.asked[c] * scale * wp.pow(dt, power))
+        share = error / may_make(a.asked[c], dt)
         sum = dt * share
         if wp.static(independent):
             sum = dt * share * share
@@ -107,7 +130,7 @@ def functions(independent: bool) -> SimpleNamespace:
             a.span_time[c] = zero
         return beyond
 
-    return SimpleNamespace(add=add)
+    return SimpleNamespace(add=add, may_make=may_make, longest=longest)
 
 
 def estimates(sums: Mapping[str, float], independent: bool) -> tuple[float, float] | None:

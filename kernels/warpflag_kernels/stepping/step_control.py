@@ -2,14 +2,16 @@
 
 The estimate of a second-order step is proportional to dt^3. Contacts that open or close make single estimates jump, but
 what adds up over time is the level between the jumps. So the control follows an exponentially weighted mean of
-log(error/dt^3); a step that followed every fluctuation would be less accurate at the same cost.
+log(error/dt^3) over some steps; a step that followed every fluctuation would be less accurate at the same cost. Where a
+motion quickens within less than that, as a filament that snaps, steps are rejected until the mean has followed.
 
 Errors of equal sign from step to step add up in proportion to the number of steps n, so one step may make the error
 error_rate dt. Independent ones add up as n^1/2, and one step may make error_rate (dt SPAN)^1/2. Which of the two holds
-is a property of the stepper.
+is a property of the stepper, and of the step (`accuracy.CORRELATION`).
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -19,14 +21,14 @@ import warp as wp
 from warpflag_kernels.base.clock import STEP_TOLERANCE
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.stepping import accuracy
-from warpflag_kernels.stepping.accuracy import SPAN, Achieved
+from warpflag_kernels.stepping.accuracy import Achieved
 
 # Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41.
 LARGEST_GROWTH = 2.0
-REJECTED = 25.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
+REJECTED = 5.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
 SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
-MEMORY = 5.0e-4  # time constant of that mean [s]
-FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of the time constant
+MEMORY = 20.0  # over how many steps that mean fades
+FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of MEMORY steps
 # If halving a rejected step leaves more than this fraction of its error, the velocity itself jumps (smooth: 1/8), and
 # shorter steps do not help.
 JUMP = 0.25
@@ -79,25 +81,23 @@ def allocate(
 def functions(p: Precision, independent: bool) -> SimpleNamespace:
     """Device functions of one precision, for errors that are independent from step to step, or of equal sign."""
     module = p.module("step_control", "independent" if independent else "systematic")
-    power = 0.5 if independent else 1.0  # of dt in the error that a step may make
-    scale = wp.constant(wp.float64(SPAN ** (1.0 - power)))
-    power, root = wp.constant(wp.float64(power)), wp.constant(wp.float64(1.0 / (3.0 - power)))
+    may_make, longest_step = accuracy.functions(independent).may_make, accuracy.functions(independent).longest
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     rejection, safety = wp.constant(wp.float64(REJECTED)), wp.constant(wp.float64(SAFETY))
-    forgotten = wp.constant(wp.float64(FORGOTTEN * MEMORY))
-    round_off, memory = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(MEMORY))
+    forgotten, fading = wp.constant(wp.float64(FORGOTTEN * MEMORY)), wp.constant(wp.float64(math.exp(-1.0 / MEMORY)))
+    round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump = wp.constant(wp.float64(JUMP))
 
     @wp.func(module=module)
     def allowed(control: StepControl, c: wp.int32, dt: wp.float64):
         """Error that a step may make [um]."""
-        return control.error_rate[c] * scale * wp.pow(dt, power)
+        return may_make(control.error_rate[c], dt)
 
     @wp.func(module=module)
     def asked(control: StepControl, c: wp.int32, dt: wp.float64):
         """Error that a step may make by the accuracy, which fixed steps need not keep [um]."""
-        return control.achieved.asked[c] * scale * wp.pow(dt, power)
+        return may_make(control.achieved.asked[c], dt)
 
     @wp.func(module=module)
     def accept(
@@ -130,23 +130,22 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
                 level = wp.log(bound / (dt * dt * dt))
-                fade = wp.exp(-dt / memory)
                 seen = error >= bound
                 # An estimate that is round-off can only lower the mean. But where round-off exceeds all that is
                 # allowed, the mean of earlier estimates stays, until its weight has faded.
                 hidden = lost > most
                 if seen or (not hidden and level * control.error_time[c] < control.error_sum[c]):
-                    control.error_sum[c] = fade * control.error_sum[c] + level * dt
-                    control.error_time[c] = fade * control.error_time[c] + dt
+                    control.error_sum[c] = fading * control.error_sum[c] + level * dt
+                    control.error_time[c] = fading * control.error_time[c] + dt
                 elif hidden:
-                    control.error_sum[c] = fade * control.error_sum[c]
-                    control.error_time[c] = fade * control.error_time[c]
-                    if control.error_time[c] < forgotten:
+                    control.error_sum[c] = fading * control.error_sum[c]
+                    control.error_time[c] = fading * control.error_time[c]
+                    if control.error_time[c] < forgotten * dt:
                         control.error_sum[c] = wp.float64(0.0)
                         control.error_time[c] = wp.float64(0.0)
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
-                    best = wp.pow(safety * scale * control.error_rate[c] / level, root)
+                    best = longest_step(safety * control.error_rate[c], level)
                     factor = wp.min(growth, wp.max(best, control.shortest[c]) / dt)
         if good:
             control.rejected_error[c] = wp.float64(0.0)
