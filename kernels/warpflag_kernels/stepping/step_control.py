@@ -26,9 +26,12 @@ from warpflag_kernels.stepping.accuracy import Achieved
 # Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41.
 LARGEST_GROWTH = 2.0
 REJECTED = 5.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
+# The same for errors of equal sign, those of RKC. In float32 they are round-off that shorter steps don't lower.
+REJECTED_SYSTEMATIC = 25.0
 SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
 MEMORY = 20.0  # over how many steps that mean fades
-FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of MEMORY steps
+MEMORY_SYSTEMATIC = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
+FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of its memory
 # If halving a rejected step leaves more than this fraction of its error, the velocity itself jumps (smooth: 1/8), and
 # shorter steps do not help.
 JUMP = 0.25
@@ -83,8 +86,10 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     module = p.module("step_control", "independent" if independent else "systematic")
     may_make, longest_step = accuracy.functions(independent).may_make, accuracy.functions(independent).longest
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
-    rejection, safety = wp.constant(wp.float64(REJECTED)), wp.constant(wp.float64(SAFETY))
-    forgotten, fading = wp.constant(wp.float64(FORGOTTEN * MEMORY)), wp.constant(wp.float64(math.exp(-1.0 / MEMORY)))
+    rejection = wp.constant(wp.float64(REJECTED if independent else REJECTED_SYSTEMATIC))
+    safety = wp.constant(wp.float64(SAFETY))
+    memory = wp.constant(wp.float64(MEMORY if independent else MEMORY_SYSTEMATIC))
+    forgotten, per_step = wp.constant(wp.float64(FORGOTTEN)), wp.constant(wp.float64(math.exp(-1.0 / MEMORY)))
     round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump = wp.constant(wp.float64(JUMP))
@@ -130,6 +135,11 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
                 level = wp.log(bound / (dt * dt * dt))
+                fading = per_step
+                kept = memory * dt
+                if wp.static(not independent):
+                    fading = wp.exp(-dt / memory)
+                    kept = memory
                 seen = error >= bound
                 # An estimate that is round-off can only lower the mean. But where round-off exceeds all that is
                 # allowed, the mean of earlier estimates stays, until its weight has faded.
@@ -140,7 +150,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                 elif hidden:
                     control.error_sum[c] = fading * control.error_sum[c]
                     control.error_time[c] = fading * control.error_time[c]
-                    if control.error_time[c] < forgotten * dt:
+                    if control.error_time[c] < forgotten * kept:
                         control.error_sum[c] = wp.float64(0.0)
                         control.error_time[c] = wp.float64(0.0)
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
