@@ -32,7 +32,9 @@ _CHECKPOINT_SECONDS = 5.0
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05
 _WRITERS = 8
-SUSPECT = 1.0  # estimate of the worst window over the accuracy from which the motion is looked at
+# Estimate of the worst window over the accuracy from which the motion is looked at, at the cost of more steps; windows
+# of sound zipping runs reach four.
+SUSPECT = 5.0
 _SECONDS_BEFORE_EXPLAINING = 2.0
 
 
