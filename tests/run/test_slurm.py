@@ -53,7 +53,7 @@ def test_wall_times_are_whole_minutes_up(seconds, text):
 
 def test_submitit_is_asked_for_by_name_where_it_is_absent(started, monkeypatch):
     monkeypatch.setitem(sys.modules, "submitit", None)
-    with pytest.raises(RunError, match=r"warpflag\[slurm\]"):
+    with pytest.raises(RunError, match="--extra slurm"):
         slurm.Jobs(started, 3600.0, count=1).submit()
 
 
