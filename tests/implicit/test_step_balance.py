@@ -85,15 +85,17 @@ def test_an_unstable_stepper_is_stopped_within_microseconds(device, precision):
 
 
 def test_an_unstable_stepper_under_control_stays_right(device, precision):
-    """Error estimates, and in float64 the balance, shorten its steps until it is sound, at twenty times the cost."""
+    """Error estimates and the balance shorten its steps until it is sound, at twenty times the cost.
+
+    In float32 round-off of so stiff a filament keeps both at the shortest step, and both are right.
+    """
     sound, sick = sound_and_sick(STIFF | {"numerics.precision": precision}, device)
     for sim in (sound, sick):
         sim.advance(1e-4)
     assert sums(sound, "refused") == 0
-    if precision == "float64":
-        assert sums(sick, "refused") > 20
     assert sick.state.motor_angle == pytest.approx(sound.state.motor_angle, rel=0.02)
-    assert sick.steps[0] > 5 * sound.steps[0]
+    if precision == "float64":
+        assert sums(sick, "refused") > 20 and sick.steps[0] > 5 * sound.steps[0]
 
 
 def test_a_step_without_energy_before_it_is_not_judged(device):
