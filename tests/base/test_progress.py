@@ -121,3 +121,13 @@ def test_closing_early_shows_where_it_stopped():
     progress.close()
     assert stream.getvalue().splitlines()[0].startswith("  7 %  1.00 / 15.00 ms")
     assert stream.getvalue().count("\n") == 1
+
+
+def test_a_line_is_told_above_the_bar(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    for stream in (Screen(), io.StringIO()):
+        progress = run(stream, Clock(), updates=75)
+        progress.tell("one member failed")
+        progress.close()
+        told = [line for line in stream.getvalue().split("\n") if "failed" in line]
+        assert [line.rpartition("\r")[2] for line in told] == ["one member failed"]

@@ -21,6 +21,7 @@ from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
 from warpflag.run.sweep import Sweep
+from warpflag.run.sweep.pool import best_size
 from warpflag.run.sweep.sweep import SweepRun
 from warpflag.scene import dumps
 
@@ -85,6 +86,16 @@ def test_means_and_standard_errors_are_those_of_the_repeats(tmp_path):
         assert "flagellum.0.torque" not in mean  # it differs from repeat to repeat
 
 
+def test_the_size_of_batches_follows_what_was_measured():
+    assert best_size(8, 2, alone=0.3, together=0.4, sample=8, largest=64)[0] == 1  # a batch is dearer
+    assert best_size(8, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 8  # one worker takes all
+    assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
+    assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
+    assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
+    size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
+    assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
+
+
 def test_what_is_done_is_not_run_again(tmp_path):
     plan = Sweep(small(BASE), {"motor.torque": TORQUES})
     sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
@@ -109,8 +120,11 @@ def test_a_member_that_a_guard_stops_is_reported_and_the_rest_done(tmp_path, cap
     outcome = started.execute(workers=1)
     assert outcome.status == "stopped" and "2 done, 1 stopped" in outcome.message
     assert started.statuses() == ["done", "stopped", "done"]
-    told = [line for line in capsys.readouterr().err.splitlines() if "stopped at" in line]
+    lines = capsys.readouterr().err.splitlines()
+    told = [line for line in lines if "stopped at" in line]
     assert len(told) == 1 and "0001" in told[0] and "flagellum" in told[0]
+    (reached,) = [float(line.partition("%")[0]) for line in lines if " / 0.12 ms" in line]
+    assert 66.0 < reached < 100.0
     assert [row["status"] for row in rows(tmp_path / "out")] == ["done", "stopped", "done"]
     again = sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
     assert again.status == "stopped"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import combinations
 
 import numpy as np
@@ -174,6 +175,22 @@ def test_all_bad_members_are_named_before_anything_starts(folder, monkeypatch):
     assert not (folder / "runs").exists()
 
 
-def test_a_mistyped_axis_is_named_with_what_was_meant(folder):
-    with pytest.raises(BadMembers, match=r"motor\.torqe.*did you mean motor\.torque"):
-        members(folder, "[axes]\nmotor.torqe = [1.0]\n")
+@pytest.mark.parametrize(
+    "table, key",
+    [
+        ("[axes]\nmotor.torqe = [1.0, 2.0, 3.0]\n", "motor.torque"),
+        ("[random]\ndraws = 3\nmotor.torqe = {low = 1, high = 2}\n", "motor.torque"),
+        ("[random]\ndraws = 3\nflagellum.torqe = {low = 1, high = 2}\n", "flagellum.torque"),
+        ("[random]\ndraws = 3\nflagellum.0.torque = {low = 1, high = 2}\n", "flagellum.torque"),
+    ],
+)
+def test_a_mistyped_key_is_named_once_with_what_was_meant(table, key, folder):
+    with pytest.raises(SceneError, match=f"(did you mean|write) {re.escape(key)}") as refused:
+        members(folder, table)
+    assert "\n" not in str(refused.value)
+
+
+def test_of_many_bad_members_the_first_are_named(folder):
+    with pytest.raises(BadMembers, match="and 80 more members") as refused:
+        members(folder, "[axes]\nmotor.torque = {from = 2e4, to = 3e4, count = 100}\n")
+    assert len(str(refused.value).splitlines()) == 21

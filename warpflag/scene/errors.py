@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Problems", "SceneError", "shown", "written"]
+__all__ = ["MOST_PROBLEMS", "Problems", "SceneError", "shown", "written"]
 
 MOST_PROBLEMS = 20  # of a scene that are told
 

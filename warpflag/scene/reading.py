@@ -28,7 +28,7 @@ from warpflag.scene.sections import (
 )
 from warpflag.scene.settings import Section, Setting
 
-__all__ = ["dumps", "load", "loads", "with_values"]
+__all__ = ["check_key", "dumps", "flagellum_example", "load", "loads", "with_values"]
 
 _SECTIONS: dict[str, type[Section]] = {
     cls.key: cls
@@ -141,7 +141,7 @@ def _built(values: Mapping[str, Any], tables: int) -> Scene:
     sections: dict[str, dict[str, Any]] = {key: {} for key in ("", *_SECTIONS)}
     for key, value in values.items():
         with problems.gathered():
-            _check_known(key, value, problems.full())
+            check_key(key, value, problems.full())
             section, _, name = key.rpartition(".")
             if section in sections:
                 sections[section][name] = value
@@ -187,8 +187,17 @@ def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
         raise SceneError.joined(told) from None
 
 
-def _check_known(key: str, value: Any, brief: bool) -> None:
-    """Raises SceneError for a key that no scene has; `brief`: without looking for one that it resembles."""
+def check_key(key: str, value: Any, brief: bool = False) -> None:
+    """That scenes have a key.
+
+    Args:
+        key: dotted; of flagellum k `flagellum.k.torque`.
+        value: told beside the key.
+        brief: without looking for a key that it resembles.
+
+    Raises:
+        SceneError: no scene has it.
+    """
     if key in _SECTIONS:
         raise SceneError(key, value, f"is a section: [{key}] with {', '.join(_SECTIONS[key].settings)}")
     if key == "flagellum":

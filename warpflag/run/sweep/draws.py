@@ -16,6 +16,7 @@ import numpy as np
 
 from warpflag.model.geometry import initial_state
 from warpflag.scene import Scene, SceneError, with_values
+from warpflag.scene.reading import check_key
 
 __all__ = ["Draws"]
 
@@ -43,6 +44,7 @@ class Draws:
         self._values = {key: table[key] for key in table if key not in ("seed", "draws", "anchors")}
         self._anchors = table.get("anchors")
         for key, spread in self._values.items():
+            _check_varied(key, spread)
             _check_spread(f"random.{key}", spread)
         if self._anchors is not None:
             self._anchors = _checked_anchors(self._anchors, base)
@@ -159,6 +161,21 @@ def _drawn(spread: Mapping[str, float], stream: np.random.Generator, count: int)
     if "low" in spread:
         return stream.uniform(spread["low"], spread["high"], count)
     return stream.normal(spread["mean"], spread["deviation"], count)
+
+
+def _check_varied(key: str, spread: Any) -> None:
+    """That scenes have the key of a spread."""
+    own = key.startswith(_PER_FLAGELLUM)
+    name = key[len(_PER_FLAGELLUM) :] if own else key
+    if own and name[:1].isdigit():
+        problem = f"is drawn for every flagellum by itself: write {_PER_FLAGELLUM}{name.partition('.')[2]}"
+        raise SceneError(f"random.{key}", spread, problem)
+    try:
+        check_key(f"{_PER_FLAGELLUM}0.{name}" if own else key, spread)
+    except SceneError as error:
+        raise SceneError(
+            f"random.{key}", spread, error.problem.replace(f"{_PER_FLAGELLUM}0.", _PER_FLAGELLUM)
+        ) from None
 
 
 def _check_spread(key: str, spread: Any) -> None:

@@ -32,10 +32,11 @@ import numpy as np
 
 from warpflag.run.sweep import draws
 from warpflag.scene import Scene, SceneError, dumps, load, with_values
-from warpflag.scene.errors import written
+from warpflag.scene.errors import MOST_PROBLEMS, written
+from warpflag.scene.reading import check_key
 from warpflag.scene.scene_file import nearest, read_overrides, read_toml
 
-__all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "grid_axes", "read"]
+__all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_axes", "read"]
 
 BASE_NAME = "base.toml"
 _KEYS = ("base", "name", "repeats", "set", "axes", "random")
@@ -43,7 +44,21 @@ _MOST_MEMBERS = 1_000_000
 
 
 class BadMembers(ValueError):
-    """Members that can't be simulated: one line each."""
+    """Members that can't be simulated: one line each, of the first."""
+
+
+def check_members(bad: Sequence[str]) -> None:
+    """That nothing is wrong with any member.
+
+    Args:
+        bad: a line for each that can't be simulated.
+
+    Raises:
+        BadMembers: with the first lines, and how many more there are.
+    """
+    if bad:
+        more = [f"and {len(bad) - MOST_PROBLEMS} more members"] if len(bad) > MOST_PROBLEMS else []
+        raise BadMembers("\n".join([*bad[:MOST_PROBLEMS], *more]))
 
 
 @dataclass(frozen=True)
@@ -90,6 +105,8 @@ class Sweep:
             BadMembers: some scenes can't be simulated; one line for each.
             SceneError: the sweep itself is not sound.
         """
+        for key, values in self.axes.items():
+            check_key(key, list(values))
         random = draws.Draws(self.random, self.base)
         repeats = _count("repeats", self.repeats)
         noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in self.axes
@@ -117,8 +134,7 @@ class Sweep:
                     bad.append(f"{label}: {error}")
                     continue
                 members.append(Member(number, point, repeat, values, scene))
-        if bad:
-            raise BadMembers("\n".join(bad))
+        check_members(bad)
         return members
 
     def dumps(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import signal
@@ -20,7 +21,7 @@ from warpflag.run.member import Outcome
 from warpflag.run.stop import Stop
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Batch", "Pool"]
+__all__ = ["Batch", "Pool", "best_size"]
 
 _SECONDS_PER_LOOK = 0.1
 _COMMAND = [sys.executable, "-m", "warpflag.run.sweep.worker"]
@@ -121,7 +122,7 @@ class Pool:
     def __init__(self, devices: Sequence[str], options: Mapping[str, Any]) -> None:
         self.devices, self._options = list(devices), dict(options)
         self._queue: queue.Queue[Batch] = queue.Queue()
-        self._finished: queue.Queue[tuple[Batch, list[Outcome]]] = queue.Queue()
+        self._finished: queue.Queue[tuple[Batch, list[Outcome], float]] = queue.Queue()
         self._open, self._done_time, self._ending = 0, 0.0, ""
         self._workers: list[_Worker] = []
         self._batch_ended = threading.Event()
@@ -172,9 +173,10 @@ class Pool:
         """Batches that have ended since the last call, and how each of their members ended."""
         found = []
         while not self._finished.empty():
-            batch, outcomes = self._finished.get()
+            batch, outcomes, reached = self._finished.get()
             found.append((batch, outcomes))
-            self._done_time += sum(scene.duration for scene in batch.scenes)
+            done = [scene.duration for scene, own in zip(batch.scenes, outcomes, strict=True) if own.status == "done"]
+            self._done_time += max(sum(done), reached)  # a member that was stopped has come as far as it was seen
             self._open -= 1
         return found
 
@@ -215,6 +217,35 @@ class Pool:
                 outcomes = [["failed", worker.restart()]] * len(batch.members)
             elif outcomes is None:
                 outcomes = [[self._ending, ""]] * len(batch.members)
+            self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes], worker.reached))
             worker.reached = 0.0
-            self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes]))
             self._batch_ended.set()
+
+
+def best_size(count: int, workers: int, alone: float, together: float, sample: int, largest: int) -> tuple[int, float]:
+    """Members of a batch with which the sweep is expected to end first, the fewest of those.
+
+    A member of a batch of s takes a + b / s: what a batch shares is spread over its members. Members differ, and which
+    are the long ones is not known, so the last batch is taken to keep one worker busy for half its length alone.
+
+    Args:
+        count: members to run.
+        workers: processes that take batches.
+        alone: time of a member by itself [s].
+        together: time per member in a batch of `sample` [s].
+        sample: members of the batch that was measured.
+        largest: most members of a batch.
+
+    Returns:
+        Members of a batch, and the wall time that is expected [s].
+    """
+    shared = min(max(0.0, (alone - together) / (1.0 - 1.0 / sample)), alone)
+    own = alone - shared
+
+    def expected(size: int) -> float:
+        rounds = math.ceil(math.ceil(count / size) / workers)
+        even = min(rounds * size, count) if workers > 1 else count
+        return (own + shared / size) * (even + (0.5 * size if workers > 1 else 0.0))
+
+    size = min(range(1, min(count, largest) + 1), key=expected)
+    return size, expected(size)

@@ -20,8 +20,8 @@ from warpflag.run.run import begun_at_checkpoint
 from warpflag.run.run_directory import RunError, check_same_scene, claim_directory, write_whole
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.sweep import table
-from warpflag.run.sweep.plan import BASE_NAME, BadMembers, Member, Sweep, read
-from warpflag.run.sweep.pool import Batch, Pool
+from warpflag.run.sweep.plan import BASE_NAME, Member, Sweep, check_members, read
+from warpflag.run.sweep.pool import Batch, Pool, best_size
 from warpflag.scene import SceneError
 from warpflag.scene.resistance import filament_mobility
 
@@ -30,7 +30,6 @@ __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
 _LARGEST_BATCH = {"cpu": 64, "cuda": 512}
-_BATCHES_PER_WORKER = 4
 _SAMPLE_CELLS = 8
 _SECONDS_PER_TABLE = 10.0
 _SECONDS_FOR_LOCKS = 10.0
@@ -150,7 +149,7 @@ class SweepRun:
                                 if outcome.status == "failed":
                                     failed[k] = outcome.message
                                 if not quiet:
-                                    print(f"warpflag: {self.names[k]}: {outcome.message}", file=sys.stderr)
+                                    progress.tell(f"warpflag: {self.names[k]}: {outcome.message}")
                     progress.update(pool.reached)
                     if monotonic() - written > _SECONDS_PER_TABLE:
                         self._write_table()
@@ -165,20 +164,19 @@ class SweepRun:
         return ended, failed
 
     def _batch_size(self, pool: Pool, pending: list[int], workers: int, quiet: bool, stop: Stop) -> int:
-        """Members of a batch: as many as keep every worker busy, where a batch was measured to be faster."""
+        """Members of a batch, by what a few of them cost alone and together."""
         group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
         if len(group) < 2:
             return 1
         alone, together = pool.measure([self.members[k].scene for k in group], stop)
         kind = "cuda" if pool.devices[0].startswith("cuda") else "cpu"
-        fair = -(-len(pending) // (_BATCHES_PER_WORKER * workers)) if kind == "cpu" else -(-len(pending) // workers)
-        size = min(_LARGEST_BATCH[kind], fair) if together < alone else 1
+        size, seconds = best_size(len(pending), workers, alone, together, len(group), _LARGEST_BATCH[kind])
         if not quiet:
             which = f"batches of {size}" if size > 1 else "one by one"
             print(
                 f"warpflag: {len(pending)} members on {workers} worker{'s' if workers > 1 else ''} "
-                f"({', '.join(dict.fromkeys(pool.devices))}), {which}: a member takes about {alone:.3g} s alone, "
-                f"{together:.3g} s in a batch of {len(group)}",
+                f"({', '.join(dict.fromkeys(pool.devices))}), {which}, about {seconds:.2g} s: a member takes "
+                f"{alone:.2g} s alone, {together:.2g} s in a batch of {len(group)}",
                 file=sys.stderr,
             )
         return size
@@ -298,7 +296,7 @@ def _check_starts(members: Sequence[Member]) -> None:
     """That every member has a start.
 
     Raises:
-        BadMembers: some have none; one line for each.
+        BadMembers: some have none.
     """
     bad, starts = [], Starts()
     for member in members:
@@ -308,8 +306,7 @@ def _check_starts(members: Sequence[Member]) -> None:
                 filament_mobility(member.scene, spec.segment_length)
         except SceneError as error:
             bad.append(f"{member.scene.name}: {error}")
-    if bad:
-        raise BadMembers("\n".join(bad))
+    check_members(bad)
 
 
 def _devices() -> list[str]:
