@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from warpflag import __version__, sweep_command, tradeoff_command, view_command
 from warpflag.base.output import machine_error
-from warpflag.base.streams import explained_cache, protected_streams
+from warpflag.base.streams import explained_cache, protected_streams, tell
 
 if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
@@ -43,16 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return options.command(options)
     except KeyboardInterrupt as error:
         status, reason = getattr(error, "status", "interrupted"), getattr(error, "reason", "")
-        return _say(status + (f" ({reason})" if reason else ""), _STATUS[status])
+        return tell(status + (f" ({reason})" if reason else ""), _STATUS[status])
     except _bad_input() as error:  # after the interrupt, which may have come while these were being imported
-        return _say(_located(error, options), BAD_INPUT)
+        return tell(_located(error, options), BAD_INPUT)
     except OSError as error:
-        return _say(machine_error(error), FAILED)
-
-
-def _say(message: object, status: int) -> int:
-    print("\n".join(f"warpflag: {line}" for line in str(message).splitlines()), file=sys.stderr)
-    return status
+        return tell(machine_error(error), FAILED)
 
 
 def _bad_input() -> tuple[type[Exception], ...]:
@@ -140,15 +134,15 @@ def _run(options: argparse.Namespace) -> int:
     if options.scene is None and options.set and "=" not in options.set[-1]:
         options.scene = options.set.pop()  # run --set key=value SCENE.toml
     if options.scene is not None and os.path.isdir(options.scene):
-        return _say(
+        return tell(
             f"{options.scene} is no SCENE.toml; to go on there: warpflag run --resume {options.scene}", BAD_INPUT
         )
     if (options.scene is None) == (options.resume is None):
-        return _say("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
+        return tell("run needs either a SCENE.toml or --resume DIR", BAD_INPUT)
     if options.resume is not None and (options.output or options.precision):
-        return _say("--resume goes on in its directory and precision; leave out -o and --precision", BAD_INPUT)
+        return tell("--resume goes on in its directory and precision; leave out -o and --precision", BAD_INPUT)
     if options.resume_or_start and not (options.scene and options.output):
-        return _say("--resume-or-start needs a SCENE.toml and -o DIR", BAD_INPUT)
+        return tell("--resume-or-start needs a SCENE.toml and -o DIR", BAD_INPUT)
     from warpflag.run.stop import Stop
 
     with Stop(options.max_wall) as stop:
@@ -166,7 +160,7 @@ def _sweep(options: argparse.Namespace) -> int:
 def _told(outcome: Outcome, options: argparse.Namespace) -> int:
     """Says how runs have ended; returns the exit status."""
     if outcome.status != "done":
-        return _say(outcome.message, _STATUS[outcome.status])
+        return tell(outcome.message, _STATUS[outcome.status])
     if not options.quiet:
         print(outcome.message)
     return DONE
@@ -199,7 +193,7 @@ def _check(options: argparse.Namespace) -> int:
     try:
         print(report(scene, options.device), end="")
     except NumericalError as error:
-        return _say(f"{scene.name}: {error}", STOPPED)
+        return tell(f"{scene.name}: {error}", STOPPED)
     return DONE
 
 
@@ -208,10 +202,8 @@ def _compile(options: argparse.Namespace) -> int:
     from warpflag.scene import Scene, load
 
     for scene in [load(path) for path in options.scenes] or [Scene(name="defaults")]:
-        print(f"warpflag: {scene.name}: compiling what is not there yet, up to two minutes", file=sys.stderr)
         simulation = Simulation(scene, device=options.device)
         simulation.prepare(recording=True)
-        next(simulation.cell_frames())  # and the kernels that measure the first frame
         print(f"{scene.name}: kernels are compiled")
     return DONE
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from typing import Any
+
+from warpflag.base.streams import tell
 
 __all__ = ["add", "tradeoff"]
 
@@ -47,8 +48,7 @@ def tradeoff(options: argparse.Namespace) -> int:
         with Stop() as stop:
             print(study.execute(options.budget, options.quiet, stop.check))
     except NumericalError as error:  # before the first frame of its course
-        print(f"warpflag: {options.scene}: {error}", file=sys.stderr)
-        return 3
+        return tell(f"{options.scene}: {error}", 3)
     return 0
 
 

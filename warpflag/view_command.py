@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 from warpflag.base.output import missing
+from warpflag.base.streams import tell
 
 if TYPE_CHECKING:
     from warpflag.view.usd import Shot
@@ -99,11 +99,11 @@ def plot(options: argparse.Namespace) -> int:
         print(options.output)
         return _DONE
     if options.x or options.kind in ("curves", "map"):
-        return _say(f"{options.directories[0]}: is no sweep, which --x, curves and map are for", _BAD_INPUT)
+        return tell(f"{options.directories[0]}: is no sweep, which --x, curves and map are for", _BAD_INPUT)
     runs = [figures.read(directory) for directory in options.directories]
     compared = options.kind == "comparison" or (options.kind is None and (len(runs) > 1 or options.y))
     if len(runs) > 1 and not compared:
-        return _say("plot --as dashboard takes one DIR", _BAD_INPUT)
+        return tell("plot --as dashboard takes one DIR", _BAD_INPUT)
     figures.save(figures.comparison(runs, options.y) if compared else figures.dashboard(runs[0]), options.output)
     print(options.output)
     return _DONE
@@ -132,7 +132,7 @@ def render(options: argparse.Namespace) -> int:
     if not options.quiet:
         print(options.output)
         if not can_write():
-            _say(f"drawn without time and scale bar: they need Pillow: {missing('Pillow', 'render')}", _DONE)
+            tell(f"drawn without time and scale bar: they need Pillow: {missing('Pillow', 'render')}", _DONE)
     return _DONE
 
 
@@ -148,9 +148,9 @@ def export(options: argparse.Namespace) -> int:
     name = {"usd": "movie.usdc", "html": "cell.html"}.get(options.to, f"run.{options.to}")
     path = Path(options.output or Path(options.directories[0]) / name)
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
-        return _say("export takes several DIR for one movie: --to usd, with -o", _BAD_INPUT)
+        return tell("export takes several DIR for one movie: --to usd, with -o", _BAD_INPUT)
     if options.mesh and options.to != "usd":
-        return _say("--mesh is for movies: --to usd", _BAD_INPUT)
+        return tell("--mesh is for movies: --to usd", _BAD_INPUT)
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":
@@ -172,11 +172,6 @@ def _shot(options: argparse.Namespace, **more: float | bool | None) -> Shot:
 
     said = {"color_by": options.color, "follow": options.follow, "slow_down": options.slow_down, **more}
     return Shot(**{name: value for name, value in said.items() if value is not None})
-
-
-def _say(message: str, status: int) -> int:
-    print(f"warpflag: {message}", file=sys.stderr)
-    return status
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -7,6 +7,7 @@ import io
 import pytest
 
 from warpflag.base.progress import Progress
+from warpflag.base.streams import tell
 
 
 class Screen(io.StringIO):
@@ -126,8 +127,9 @@ def test_closing_early_shows_where_it_stopped():
 def test_a_line_is_told_above_the_bar(monkeypatch):
     monkeypatch.setenv("COLUMNS", "60")
     for stream in (Screen(), io.StringIO()):
-        progress = run(stream, Clock(), updates=75)
-        progress.tell("one member failed")
+        monkeypatch.setattr("sys.stderr", stream)
+        progress = run(None, Clock(), updates=75)
+        assert tell("one member failed", 3) == 3
         progress.close()
         told = [line for line in stream.getvalue().split("\n") if "failed" in line]
-        assert [line.rpartition("\r")[2] for line in told] == ["one member failed"]
+        assert [line.rpartition("\r")[2] for line in told] == ["warpflag: one member failed"]

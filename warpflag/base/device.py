@@ -7,7 +7,6 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from warpflag.base.streams import say
@@ -16,9 +15,8 @@ __all__ = [
     "LAUNCHING",
     "DeviceError",
     "alone",
-    "compiled_modules",
+    "cores",
     "find_device",
-    "kernel_folder",
     "list_devices",
     "start_warp",
 ]
@@ -94,17 +92,9 @@ def find_device(name: Any = None) -> Any:
         raise DeviceError(f"device {name}: not here; this machine has {aliases}") from error
 
 
-def kernel_folder() -> Path:
-    """Where Warp keeps compiled kernels: WARP_CACHE_PATH, or a folder of the user's cache."""
-    return Path(start_warp().config.kernel_cache_dir)
-
-
-def compiled_modules() -> set[str]:
-    """Modules of kernels in the cache; one that is just being compiled is there, too."""
-    try:
-        return set(os.listdir(kernel_folder()))
-    except OSError:
-        return set()
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def list_devices() -> list[str]:

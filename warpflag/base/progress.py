@@ -70,14 +70,6 @@ class Progress:
             if time - before >= _LOG_SHARE * self._total:
                 self._show(now)
 
-    def tell(self, line: str) -> None:
-        """Writes a line above the bar, or between the lines of a log."""
-        if self._bar is not None:
-            self._bar.clear()
-        say(line + "\n", self._stream)
-        if self._bar is not None:
-            self._bar.refresh()
-
     def close(self) -> None:
         """Shows the last time reported and ends the line."""
         if self._quiet or self._time is None:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
-__all__ = ["explained_cache", "is_terminal", "protected_streams", "say"]
+__all__ = ["explained_cache", "is_terminal", "protected_streams", "say", "tell"]
 
 
 def say(text: str, stream: TextIO | None = None) -> bool:
@@ -32,6 +32,23 @@ def say(text: str, stream: TextIO | None = None) -> bool:
     except (OSError, ValueError):  # full, or without a reader; closed
         return False
     return True
+
+
+def tell(message: object, status: int = 0) -> int:
+    """Tells the user on standard error, above any bar that is shown; each line begins with the program's name.
+
+    Args:
+        message: a line or several.
+        status: handed back, for a command that ends with these words.
+    """
+    library = sys.modules.get("tqdm")  # whoever shows a bar has imported it
+    bars = list(getattr(library.tqdm, "_instances", ())) if library else []
+    for bar in bars:
+        bar.clear()
+    say("".join(f"warpflag: {line}\n" for line in str(message).splitlines()))
+    for bar in bars:
+        bar.refresh()
+    return status
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -107,8 +124,7 @@ def explained_cache(command: Callable[..., int]) -> Callable[..., int]:
             if not _is_of_cache(error):
                 raise
             folder, words = sys.modules["warp"].config.kernel_cache_dir, " ".join(str(error).split())
-            say(f"warpflag: kernel cache {folder}: can't be read ({words}); without it kernels compile anew\n")
-            return 1
+            return tell(f"kernel cache {folder}: can't be read ({words}); without it kernels compile anew", 1)
 
     return explained
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import sys
-import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, process_time
@@ -14,9 +12,8 @@ from typing import Any
 import numpy as np
 from warpflag_kernels.stepping.health import Fault
 
-from warpflag.base.device import compiled_modules, kernel_folder
 from warpflag.base.progress import Progress
-from warpflag.base.streams import say
+from warpflag.base.streams import tell
 from warpflag.record import Frame, Record, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
@@ -35,7 +32,6 @@ _WRITERS = 8
 # Estimate of the worst window over the accuracy from which the motion is looked at, at the cost of more steps; windows
 # of sound zipping runs reach four.
 SUSPECT = 5.0
-_SECONDS_BEFORE_EXPLAINING = 2.0
 
 
 class Run:
@@ -111,7 +107,7 @@ class Run:
 
         for member, notes in zip(self.members, self.simulation.notes, strict=True):
             for note in () if quiet else notes:
-                print(f"warpflag: {member.scene.name}: {note}", file=sys.stderr)
+                tell(f"{member.scene.name}: {note}")
         self._check = stop.check
         try:
             stop.check()
@@ -129,25 +125,14 @@ class Run:
             self._end(ended)
 
     def _prepare(self, quiet: bool, stop: Stop) -> None:
-        before = compiled_modules()
-
-        def explain() -> None:
-            if compiled_modules() - before:
-                kinds = "compiling kernels, once for each kind of scene, up to two minutes"
-                say(f"warpflag: {kinds}; kept in {kernel_folder()}\n")
-
-        timer = threading.Timer(_SECONDS_BEFORE_EXPLAINING, explain)
-        if not quiet:
-            timer.start()
         stop.at_once = True
         try:
-            self.simulation.prepare(recording=True)
+            self.simulation.prepare(recording=True, quiet=quiet)
         except Exception:
             stop.check()  # what a signal raises amid other code may come out as another error
             raise
         finally:
             stop.at_once = False
-            timer.cancel()
 
     def _record(self, look: Callable[[], None]) -> None:
         given = self._given_interval

@@ -7,7 +7,6 @@ checkpoint with the numbers of a run that was never stopped.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warpflag import __version__
+from warpflag.base.streams import tell
 from warpflag.model.start import shape_of_frame
 from warpflag.record import RECORD_NAME, Record
 from warpflag.run import checkpoint
@@ -192,7 +192,7 @@ def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[s
         problem = f"must not be below {meta['time']:g} s, where the run stands"
         raise SceneError("duration", scene.duration, problem, source=f"--resume {path}")
     if (written := meta["versions"]["warpflag"]) != __version__:
-        print(f"warpflag: {path} was written by version {written}, this is {__version__}", file=sys.stderr)
+        tell(f"{path} was written by version {written}, this is {__version__}")
     return arrays, meta
 
 

@@ -13,9 +13,11 @@ from warpflag_kernels.base import clock as control_stage
 from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.rod import reconstruction
 from warpflag_kernels.stepping import evaluation_time, health
+from warpflag_kernels.stepping.dense_output import take_rest
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
 from warpflag.base.device import LAUNCHING, alone, find_device
+from warpflag.base.kernels import load_kernels
 from warpflag.base.progress import watching
 from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
@@ -34,9 +36,6 @@ __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
 _SECONDS_PER_REPLAY = 0.2
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
-# Of the chart; with the clocks, the last check's positions and the stepper's memory all that goes from step to step.
-_KEPT_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
-_KEPT_FORMS, _KEPT_CHART = ("form", "before", "changed"), ("flagellum_spin", "motor_angle", "body_angle")
 
 
 class Simulation:
@@ -87,7 +86,7 @@ class Simulation:
         self._first_flagellum = model.data.first_flagellum.numpy()
         self.reporters = list(reporters)
         self._capture, self._graph = capture, None
-        self._checked = False
+        self._checked, self._loaded = False, False
         self._passes_per_replay = 200
         self._frames = Frames(self.system, self.scenes)
         self._reader = CellsReader(self.system)
@@ -177,9 +176,9 @@ class Simulation:
             An iterator over blocks: the next frame of each cell that has one, by cell; then those after them; and so
             on. A block may be empty, since the host also looks a few times a second.
         """
+        self.prepare(recording=True)
         if (self._frames.index < 0).all():
             yield self._frames.first(self._present_state())
-        self.prepare(recording=True)
         while self._schedule(until):
             self._advance(self._frames.targets(until), watch, _SECONDS_PER_BLOCK)
             yield self._collect(until)
@@ -201,24 +200,22 @@ class Simulation:
         self._excluded[cell] = True
 
     @alone
-    def prepare(self, recording: bool = False) -> None:
+    def prepare(self, recording: bool = False, quiet: bool = False) -> None:
         """Loads every kernel, checks the start and captures the pass; otherwise the first `advance` does.
 
         Args:
             recording: frames will be taken.
+            quiet: say nothing while kernels are compiled.
         """
-        if not self._checked:
-            self._check_start()
         if recording and not self._frames.taken:
             self._take_frames()
+        if not self._loaded:
+            load_kernels(self._launch_all, self.device, quiet)
+            self._loaded = True
+        if not self._checked:
+            self._check_start()
         if not self._capture or self._graph is not None:
             return
-        # Kernels load before the capture, also those of the passes between steps; no cell is active here, so a pass
-        # changes nothing.
-        self.system.control.between_steps.fill_(1)
-        if self.stepper.dense is not None:
-            self.stepper.dense.data.any_due.fill_(1)
-        self.stepper.launch_pass()
         with wp.ScopedCapture(device=self.device) as captured:
             wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
         self._graph = captured.graph
@@ -226,7 +223,16 @@ class Simulation:
     def _take_frames(self) -> None:
         """Has the stepper take frames; a pass that was captured without is captured anew."""
         self._frames.take_from(self.stepper)
-        self._graph = None
+        self._graph, self._loaded = None, False
+
+    def _launch_all(self) -> None:
+        """Launches whatever a run launches, to find its kernels."""
+        self._present_state()
+        self._check_start()
+        self.stepper.launch_pass()
+        if self.stepper.dense is not None:
+            take_rest(self.system.model, self.system.control, self.stepper.dense)
+        self._checked = False
 
     def advance(self, until: float, watch: Callable[[], None] | None = None) -> None:
         """Advances every cell to one time.
@@ -294,7 +300,7 @@ class Simulation:
     @alone
     def checkpoint(self) -> dict[str, np.ndarray]:
         """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
-        own = {name: array.numpy().copy() for name, array in self._carried().items()}
+        own = {name: array.numpy().copy() for name, array in self.system.carried().items()}
         own |= {f"frame.{name}": values for name, values in self._frames.memory().items()}
         return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
 
@@ -305,7 +311,7 @@ class Simulation:
         Raises:
             ValueError: the arrays are of another simulation.
         """
-        carried = self._carried()
+        carried = self.system.carried()
         parts = {
             part: {name.partition(".")[2]: x for name, x in arrays.items() if name.startswith(f"{part}.")}
             for part in ("stepper", "frame")
@@ -333,19 +339,6 @@ class Simulation:
         # Where two of the sizes are equal, each cell has one flagellum, and the parts are equal too.
         rows = dict(zip(sizes, (slice(cell, cell + 1), flagella, nodes), strict=True))
         return {name: values[rows[len(values)]] for name, values in arrays.items()}
-
-    def _carried(self) -> dict[str, Any]:
-        control, chart = self.system.control, self.system.chart
-        carried = {"control.time": control.time, "control.steps": control.steps}
-        carried |= {f"chart.base_{name}": getattr(chart.base, name) for name in _KEPT_POSE}
-        carried |= {f"chart.{name}": getattr(chart, name) for name in _KEPT_CHART}
-        if self.system.model.switches.steric:
-            carried["guard.position"] = self.system.guard.position
-        if self.system.model.switches.has("polymorphs"):
-            carried |= {f"forms.{name}": getattr(self.system.state.data.forms, name) for name in _KEPT_FORMS}
-        if self.system.model.switches.has("hook that stiffens"):
-            carried["motor.on_hook"] = self.system.state.data.motor.on_hook
-        return carried
 
     @alone
     def evaluate(self, cell: int = 0) -> Evaluation:

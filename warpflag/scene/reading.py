@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from warpflag.base.streams import tell
 from warpflag.scene import scene_file
 from warpflag.scene.errors import Problems, SceneError, shown, written
 from warpflag.scene.formats import BEFORE_FORMATS
@@ -131,7 +131,7 @@ def _tell_format(path: str | Path, values: Mapping[str, Any]) -> None:
     if left_out and str(path) not in _told:
         _told.add(str(path))
         said = f"has no format, so it has {', '.join(left_out)}; format = 1 converges"
-        print(f"warpflag: {path}: {said}", file=sys.stderr)
+        tell(f"{path}: {said}")
 
 
 def _built(values: Mapping[str, Any], tables: int) -> Scene:

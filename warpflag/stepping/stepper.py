@@ -26,6 +26,10 @@ __all__ = [
 ]
 
 
+_POSE = ("position", "tangent", "director", "body_position", "body_orientation")
+_ANGLES, _FORMS = ("flagellum_spin", "motor_angle", "body_angle"), ("form", "before", "changed")
+
+
 @dataclass(frozen=True)
 class System:
     """Everything on the device: model, state, chart, clocks and guards."""
@@ -35,6 +39,20 @@ class System:
     chart: Any
     control: Any
     guard: Any
+
+    def carried(self) -> dict[str, Any]:
+        """Arrays that go from step to step, by name; beside them only what the stepper and the frames remember."""
+        control, chart = self.control, self.chart
+        carried = {"control.time": control.time, "control.steps": control.steps}
+        carried |= {f"chart.base_{name}": getattr(chart.base, name) for name in _POSE}
+        carried |= {f"chart.{name}": getattr(chart, name) for name in _ANGLES}
+        if self.model.switches.steric:
+            carried["guard.position"] = self.guard.position
+        if self.model.switches.has("polymorphs"):
+            carried |= {f"forms.{name}": getattr(self.state.data.forms, name) for name in _FORMS}
+        if self.model.switches.has("hook that stiffens"):
+            carried["motor.on_hook"] = self.state.data.motor.on_hook
+        return carried
 
 
 DEFAULT_ACCURACY = ACCURACY_LEVELS["standard"]

@@ -7,7 +7,6 @@ the picture says by how much. The scale bar holds at the distance of the middle 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from warpflag.base.device import find_device
 from warpflag.base.output import OutputError
 from warpflag.base.progress import Progress
+from warpflag.base.streams import tell
 from warpflag.record import Record
 from warpflag.view.coloring import DISPLAY_RADIUS
 from warpflag.view.images import PICTURES, check_rate, check_writable, write_animation, write_picture
@@ -166,7 +166,7 @@ def render(
     if is_film and not quiet:
         seconds = len(codes) * _seconds_per_picture(renderer, codes)
         film_length = f"{len(codes)} pictures of {size[0]}x{size[1]}, a film of {len(codes) / rate:.1f} s"
-        print(f"{output}: {film_length}; drawing it takes about {seconds:.0f} s", file=sys.stderr)
+        tell(f"{output}: {film_length}; drawing it takes about {seconds:.0f} s")
     progress = Progress(film.time(codes[-1]), quiet=quiet or len(codes) == 1)
     try:
         if is_film:

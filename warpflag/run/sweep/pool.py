@@ -149,11 +149,12 @@ class Pool:
         """Simulated time that all members have reached [s]."""
         return self._done_time + sum(worker.reached for worker in self._workers)
 
-    def measure(self, scenes: Sequence[Scene], stop: Stop) -> tuple[float, float]:
+    def measure(self, scenes: Sequence[Scene], stop: Stop, quiet: bool = False) -> tuple[float, float]:
         """Wall time per cell alone and in a batch [s], measured by the first worker on these scenes."""
         stop.at_once = True
         try:
-            answer = self._workers[0].ask({"measure": [dumps(scene) for scene in scenes], "device": self.devices[0]})
+            texts = [dumps(scene) for scene in scenes]
+            answer = self._workers[0].ask({"measure": texts, "device": self.devices[0], "quiet": quiet})
         finally:
             stop.at_once = False
         if "alone" not in answer:  # one by one, so that each member tells what is wrong

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from warpflag.base.device import start_warp
+from warpflag.base.device import cores, start_warp
 from warpflag.base.progress import Progress
+from warpflag.base.streams import tell
 from warpflag.model.build import switches_of
 from warpflag.model.starts import Starts
 from warpflag.run.lock import SWEEP_NAME, Lock, LockedError
@@ -131,7 +130,7 @@ class SweepRun:
         options: dict[str, Any],
     ) -> tuple[Ended | None, dict[int, str]]:
         devices = [device] if device else _devices()
-        count = min(workers or (len(devices) if devices != ["cpu"] else _cores()), len(pending))
+        count = min(workers or (len(devices) if devices != ["cpu"] else cores()), len(pending))
         progress = Progress(sum(self.members[k].scene.duration for k in pending), quiet=quiet)
         failed: dict[int, str] = {}
         written = monotonic()
@@ -149,7 +148,7 @@ class SweepRun:
                                 if outcome.status == "failed":
                                     failed[k] = outcome.message
                                 if not quiet:
-                                    progress.tell(f"warpflag: {self.names[k]}: {outcome.message}")
+                                    tell(f"{self.names[k]}: {outcome.message}")
                     progress.update(pool.reached)
                     if monotonic() - written > _SECONDS_PER_TABLE:
                         self._write_table()
@@ -168,16 +167,15 @@ class SweepRun:
         group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
         if len(group) < 2:
             return 1
-        alone, together = pool.measure([self.members[k].scene for k in group], stop)
+        alone, together = pool.measure([self.members[k].scene for k in group], stop, quiet)
         kind = "cuda" if pool.devices[0].startswith("cuda") else "cpu"
         size, seconds = best_size(len(pending), workers, alone, together, len(group), _LARGEST_BATCH[kind])
         if not quiet:
             which = f"batches of {size}" if size > 1 else "one by one"
-            print(
-                f"warpflag: {len(pending)} members on {workers} worker{'s' if workers > 1 else ''} "
+            tell(
+                f"{len(pending)} members on {workers} worker{'s' if workers > 1 else ''} "
                 f"({', '.join(dict.fromkeys(pool.devices))}), {which}, about {seconds:.2g} s: a member takes "
-                f"{alone:.2g} s alone, {together:.2g} s in a batch of {len(group)}",
-                file=sys.stderr,
+                f"{alone:.2g} s alone, {together:.2g} s in a batch of {len(group)}"
             )
         return size
 
@@ -311,7 +309,3 @@ def _check_starts(members: Sequence[Member]) -> None:
 
 def _devices() -> list[str]:
     return [device.alias for device in start_warp().get_cuda_devices()] or ["cpu"]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,9 +1,9 @@
 """A worker of a sweep: a process that runs batches as they come on its standard input, and answers on its output.
 
 Requests and answers are JSON, one a line. A request is a batch: {"directories", "scenes" (TOML texts), "device",
-"options"}; {"measure": [TOML texts], "device"} asks what a cell costs alone and in a batch. Answers: {"reached"}
-while it runs [s], then {"outcomes": [[status, message], ...]}; or {"alone", "together"} [s]. At the end of its input,
-also when the process that started it is gone, the worker ends its batch resumable.
+"options"}; {"measure": [TOML texts], "device", "quiet"} asks what a cell costs alone and in a batch. Answers:
+{"reached"} while it runs [s], then {"outcomes": [[status, message], ...]}; or {"alone", "together"} [s]. At the end of
+its input, also when the process that started it is gone, the worker ends its batch resumable.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def _started(directories: list[Path], scenes: list[Scene], request: dict[str, An
 def _measured(request: dict[str, Any]) -> dict[str, Any]:
     """Wall time per cell of its start and of stepping through the whole scene, alone and in a batch [s]."""
     scenes = [loads(text) for text in request["measure"]]
-    Simulation(scenes[0], device=request["device"]).prepare()  # loads the kernels
+    Simulation(scenes[0], device=request["device"]).prepare(recording=True, quiet=request["quiet"])  # loads the kernels
     return {
         "alone": _cost(scenes[:1], request["device"]),
         "together": _cost(scenes, request["device"]),

@@ -104,13 +104,18 @@ def _shown(x: float, measure: str) -> str:
 
 
 def _lengths(course: Course) -> list[str]:
-    """How long a run must be for a mean to be known to 1 %, from how its parts differ."""
-    lines = [f"means over the last third of {1e3 * course.until:.4g} ms, and the run that knows them to 1 %:"]
+    """How long a run must be for a mean to be known to 1 %, from how its parts differ.
+
+    Means over n parts that are independent differ by the spread of the parts over the root of n. No time below a part
+    is told: how shorter ones differ was not looked at.
+    """
+    lines = [f"means over the last third of {1e3 * course.until:.4g} ms, and the time that knows them to 1 %:"]
     for name, (mean, spread) in course.rates.items():
-        needed = course.span * (spread / (0.01 * abs(mean))) ** 2 if mean else float("nan")
-        lines.append(
-            f"  {name}: {mean:.4g}, parts of {1e3 * course.span:.3g} ms differ by {spread:.2g}: {1e3 * needed:.3g} ms"
-        )
+        parts = (spread / (0.01 * abs(mean))) ** 2 if mean else float("nan")
+        told = f"{1e3 * course.span * parts:.3g} ms" if parts > 1.0 else "one part will do"
+        if math.isnan(parts):
+            told = "unknown"
+        lines.append(f"  {name}: {mean:.4g}, parts of {1e3 * course.span:.3g} ms differ by {spread:.2g}: {told}")
     return [*lines, ""]
 
 

@@ -10,6 +10,7 @@ from time import monotonic
 
 from warpflag.base.device import list_devices
 from warpflag.base.output import OutputError
+from warpflag.base.progress import bar
 from warpflag.base.streams import is_terminal, say
 from warpflag.record import Record
 from warpflag.run.lock import Lock
@@ -211,24 +212,26 @@ class Study:
 
 
 class _Line:
-    """The progress of a study: one line that is redrawn on a terminal, a line per tenth elsewhere."""
+    """The progress of a study: a bar on a terminal, a line per tenth elsewhere."""
 
     def __init__(self, quiet: bool) -> None:
-        self._quiet, self._terminal, self._width, self._tenth = quiet, is_terminal(sys.stderr), 0, -1
+        self._quiet, self._bar, self._tenth = quiet, None, -1
 
     def show(self, done: int, count: int, what: str, left: float) -> None:
+        said = f"{what}, {max(0, math.ceil(left))} s left"
         if self._quiet:
             return
-        line = f"{done:3d} of {count}  {what}, {max(0, math.ceil(left))} s left"
-        if self._terminal:
-            filled = int(16 * done / max(count, 1))
-            line = f"[{'#' * filled}{'.' * (16 - filled)}] {line}"
-            self._quiet = not say("\r" + line.ljust(self._width), sys.stderr)
-            self._width = len(line)
+        if is_terminal(sys.stderr):
+            if self._bar is None or self._bar.total != count:
+                self.close()
+                self._bar = bar(count, "{n:.0f} of {total:.0f} |{bar}| {desc}")
+            self._bar.n = done
+            self._bar.set_description_str(said)
         elif int(10 * done / max(count, 1)) != self._tenth:
             self._tenth = int(10 * done / max(count, 1))
-            self._quiet = not say(line + "\n", sys.stderr)
+            self._quiet = not say(f"{done:3d} of {count}  {said}\n")
 
     def close(self) -> None:
-        if self._terminal and self._width and not self._quiet:
-            say("\n", sys.stderr)
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

@@ -1,0 +1,109 @@
+"""Kernels are found before they run, compiled together, and what is compiled is said."""
+
+from __future__ import annotations
+
+import io
+import itertools
+
+import pytest
+import warp as wp
+
+from tests.helpers import cell
+from warpflag.base import kernels
+from warpflag.base.device import find_device
+from warpflag.base.kernels import load_kernels, noted_launches
+from warpflag.run.simulation import Simulation
+
+_NUMBER = itertools.count()
+
+
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def two_kernels():
+    """Kernels in modules of their own, and what launches them: the second under a condition that is not met."""
+
+    def made():
+        module = wp.get_module(f"tests.base.{next(_NUMBER)}")  # one that no other test has loaded
+        module.options["enable_backward"] = False
+
+        @wp.kernel(module=module)
+        def fill(
+            # Out:
+            values: wp.array(dtype=wp.int32),
+        ):
+            values[wp.tid()] = 7
+
+        return fill
+
+    first, second = made(), made()
+    values = wp.zeros(3, dtype=wp.int32, device="cpu")
+
+    def launch() -> None:
+        wp.launch(first, 3, inputs=[values], device="cpu")
+        wp.capture_if(values[:1], lambda: wp.launch(second, 3, inputs=[values], device="cpu"))
+
+    return {first, second}, values, launch
+
+
+def test_noted_launches_are_not_made():
+    both, values, launch = two_kernels()
+    with noted_launches() as noted:
+        launch()
+    assert {kernel for kernel, _ in noted} == both and not values.numpy().any()
+    launch()
+    assert (values.numpy() == 7).all()
+
+
+@pytest.mark.parametrize("stream", [Screen, io.StringIO])
+def test_what_is_compiled_is_said_once(stream, tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(kernels, "_SECONDS_BEFORE_EXPLAINING", 0.0)
+    monkeypatch.setenv("COLUMNS", "60")
+    said = stream()
+    monkeypatch.setattr("sys.stderr", said)
+    _, values, launch = two_kernels()
+    load_kernels(launch, find_device("cpu"))
+    assert len(list(tmp_path.iterdir())) == 2 and not values.numpy().any()
+    lines = [line.rpartition("\r")[2] for line in said.getvalue().removesuffix("\n").split("\n")]
+    assert lines[0].startswith("warpflag: compiling 2 modules of kernels, once") and str(tmp_path) in lines[0]
+    shown = [line for line in lines[1:] if line.startswith("compiling kernels, 2 of 2")]
+    assert len(shown) == (stream is Screen) and len(lines) == 1 + len(shown)
+    load_kernels(launch, find_device("cpu"))  # from the cache
+    assert said.getvalue().count("modules of kernels") == 1
+
+
+def test_quiet_says_nothing(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(kernels, "_SECONDS_BEFORE_EXPLAINING", 0.0)
+    load_kernels(two_kernels()[2], find_device("cpu"), quiet=True)
+    assert len(list(tmp_path.iterdir())) == 2 and capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"numerics.stepper": "implicit"},
+        {"numerics.stepper": "implicit", "flagella.count": 3, "hydrodynamics.mode": "consistent"},
+        {"numerics.stepper": "rkc"},
+        {"numerics.stepper": "implicit", "fluid.temperature": 300.0},
+    ],
+)
+def test_a_run_launches_no_kernel_that_was_not_loaded_before(values, monkeypatch):
+    loaded, late, launch = set(), set(), wp.launch
+    simulation = Simulation(cell({"duration": 2e-5, "frames": 3, **values}), device="cpu", capture=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(kernels, "_load", lambda module, _block, _device: loaded.add(module))
+        simulation.prepare(recording=True)
+
+    def spied(kernel, *arguments, **options):
+        if kernel.module not in loaded:
+            late.add(kernel.key)
+        launch(kernel, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(wp, "launch", spied)
+        frames = list(simulation.cell_frames())
+    assert len(frames) == 4 and len(loaded) > 10 and not late

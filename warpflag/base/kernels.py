@@ -1,0 +1,117 @@
+"""Kernels that are about to run: found, compiled side by side where they are not in the cache, and loaded."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from warpflag.base.device import cores, start_warp
+from warpflag.base.progress import bar
+from warpflag.base.streams import is_terminal, tell
+
+__all__ = ["kernel_folder", "load_kernels", "noted_launches"]
+
+_MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
+_SECONDS_BEFORE_EXPLAINING = 2.0
+_SECONDS_PER_LOOK = 0.2
+
+
+def kernel_folder() -> Path:
+    """Where Warp keeps compiled kernels: WARP_CACHE_PATH, or a folder of the user's cache."""
+    return Path(start_warp().config.kernel_cache_dir)
+
+
+@contextlib.contextmanager
+def noted_launches() -> Iterator[set[tuple[Any, int | None]]]:
+    """While it lasts, launches are noted instead of made, those under a condition once; hold `LAUNCHING`.
+
+    Returns:
+        Kernels that were launched, each with its block size where one was given.
+    """
+    wp, noted = start_warp(), set()
+
+    def launch(kernel: Any, *_arguments: Any, block_dim: int | None = None, **_options: Any) -> None:
+        noted.add((kernel, block_dim))
+
+    def under(_condition: Any, *bodies: Any, **options: Any) -> None:
+        for body in (*bodies, options.pop("on_true", None), options.pop("on_false", None)):
+            if body is not None:
+                body(**options)
+
+    own = {"launch": launch, "capture_if": under, "capture_while": under}
+    kept = {name: getattr(wp, name) for name in own}
+    try:
+        for name, function in own.items():
+            setattr(wp, name, function)
+        yield noted
+    finally:
+        for name, function in kept.items():
+            setattr(wp, name, function)
+
+
+def load_kernels(launch: Callable[[], None], device: Any, quiet: bool = False) -> None:
+    """Loads the kernels that a function launches; several modules at once are compiled where they are not in the cache.
+
+    Args:
+        launch: launches them; nothing of it is run, and arrays stay as they are.
+        device: of Warp.
+        quiet: say nothing; otherwise compiling that lasts is explained on standard error.
+    """
+    with noted_launches() as noted:
+        launch()
+    modules = {(kernel.module, block) for kernel, block in noted}
+    waiting = sorted(((module, block) for module, block in modules), key=lambda own: (own[0].name, own[1] or 0))
+    folder = kernel_folder()
+    missing = {folder / module.get_module_identifier(1 if device.is_cpu else block) for module, block in waiting}
+    missing = {path for path in missing if not path.exists()}
+    if not missing:
+        for module, block in waiting:
+            _load(module, block, device)
+        return
+    with _explained(missing, quiet):
+        pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores()))
+        try:
+            for loaded in [pool.submit(_load, module, block, device) for module, block in waiting]:
+                loaded.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
+
+
+def _load(module: Any, block: int | None, device: Any) -> None:
+    start_warp().force_load(device, [module], block, 0)
+
+
+@contextlib.contextmanager
+def _explained(missing: set[Path], quiet: bool) -> Iterator[None]:
+    """While it lasts, says how many of the modules that were missing are in the cache; nothing if it does not last."""
+    over = threading.Event()
+
+    def explain() -> None:
+        if over.wait(_SECONDS_BEFORE_EXPLAINING):
+            return
+        kind = f"compiling {len(missing)} modules of kernels, once for each kind of scene on each machine"
+        tell(f"{kind}, up to two minutes; kept in {kernel_folder()}")
+        if not is_terminal(sys.stderr):
+            return
+        shown = bar(len(missing), "compiling kernels, {n:.0f} of {total:.0f} |{bar}| {elapsed}")
+        while not over.wait(_SECONDS_PER_LOOK):
+            shown.update(sum(map(os.path.exists, missing)) - shown.n)
+            shown.refresh()
+        shown.update(sum(map(os.path.exists, missing)) - shown.n)
+        shown.close()
+
+    thread = threading.Thread(target=explain, daemon=True)
+    if not quiet:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        if not quiet:
+            thread.join()
