@@ -40,8 +40,7 @@ plt = pyplot()
 
 
 def save(figure, name: str) -> None:
-    figure.tight_layout()
-    figure.savefig(options.output / f"{name}.png", dpi=90)
+    figure.savefig(options.output / f"{name}.png", dpi=120)
     plt.close(figure)
 
 
@@ -56,7 +55,7 @@ def run_and_tumble() -> None:
     speed = np.linalg.norm(np.gradient(smooth, times, axis=0), axis=1)
     plane = np.linalg.svd(smooth - smooth.mean(axis=0), full_matrices=False)[2][:2]
     path = (smooth - smooth[0]) @ plane.T
-    figure = plt.figure(figsize=(8, 3.6))
+    figure = plt.figure(figsize=(8, 3.6), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=[1, 1.5])
     axes = figure.add_subplot(grid[:, 0], xlabel="µm", ylabel="µm", title="path, from the dot")
     axes.plot(*np.where(reverse[:, None], np.nan, path).T, label="all forward")
@@ -82,7 +81,8 @@ def reversal() -> None:
         assert forms is not None
         t, along = 1e3 * record.times[:], 6.0 / 30 * np.arange(1, 30)
         drive, joints = record.observables["motor_drive"][:, 0], forms[:, 1:-1]
-    figure, (above, axes) = plt.subplots(2, sharex=True, figsize=(5, 3.2), height_ratios=[1, 4])
+    shape = {"figsize": (6, 3.8), "height_ratios": [1, 4], "layout": "constrained"}
+    figure, (above, axes) = plt.subplots(2, sharex=True, **shape)
     above.fill_between(t, 0, drive, color="C3", lw=0)
     above.set(ylabel="drive", ylim=(-1.2, 1.2))
     axes.contourf(t, along, joints.T, levels=[-0.5, 0.5, 1.5], colors=FORM_COLORS[:2])
@@ -95,19 +95,19 @@ def reversal() -> None:
 
 def unequal_motors() -> None:
     """Turns by which the second motor lags, and bundle length, over time."""
-    figure, (above, below) = plt.subplots(2, sharex=True, figsize=(5, 4))
+    figure, (above, below) = plt.subplots(2, sharex=True, figsize=(7, 4.4), layout="constrained")
     for torque in TORQUES:
         values = {"flagellum.1.torque": torque, "numerics.on_accuracy": "warn"}
         scene = with_values(load(HERE / "unequal_motors.toml"), values)
         frames = list(Simulation(scene, device="cpu").frames(scene.duration))
         t = [1e3 * frame.time for frame in frames]
         angles = np.array([frame.motor_angle for frame in frames])
-        above.plot(t, (angles[:, 0] - angles[:, 1]) / (2 * np.pi), label=f"{torque:g}")
+        above.plot(t, (angles[:, 0] - angles[:, 1]) / (2 * np.pi), label=f"{TORQUES[0]:g} and {torque:g}")
         length = np.convolve([frame.observables["bundle_length"] for frame in frames], np.ones(25) / 25, "valid")
         below.plot(t[12:-12], length)
-    above.set(ylabel="lag, turns", ylim=(-0.5, 8), title="3.4 pN µm, and the second motor's:")
-    above.legend(frameon=False, fontsize=8, ncols=len(TORQUES), loc="upper left")
-    below.set(xlabel="ms", ylabel="$l_r$, mean of 5 ms", xlim=(0, t[-1]))
+    above.set(ylabel="lag, turns", ylim=(-0.5, 8))
+    figure.legend(*above.get_legend_handles_labels(), loc="outside right upper", title="torques, pN µm", frameon=False)
+    below.set(xlabel="ms", ylabel="$l_r$, mean of 5 ms", xlim=(0, t[-1]), ylim=(0, 1.05))
     save(figure, "unequal_motors")
 
 

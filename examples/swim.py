@@ -6,6 +6,7 @@ Two flagella a third shorter than the paper's, from the same side of the body. U
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
@@ -15,20 +16,22 @@ from warpflag.scene import Flagella, FlagellumOverride, Motor
 options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 options.add_argument("duration", nargs="?", type=float, default=0.002)
 options.add_argument("-o", dest="output", default="run.h5")
-options = options.parse_args()
+arguments = options.parse_args()
+if Path(arguments.output).exists():
+    options.error(f"{arguments.output}: exists already; name another with -o, or remove it")
 
 scene = Scene(
     name="swim",
-    duration=options.duration,
+    duration=arguments.duration,
     frames=40,
     flagella=Flagella(count=2, length=4.0),
     flagellum=(FlagellumOverride(azimuth=-40.0), FlagellumOverride(azimuth=40.0)),
     motor=Motor(torque=2.0),
 )
-simulation = Simulation(scene, device="cpu", reporters=[Recorder(options.output)])
+simulation = Simulation(scene, device="cpu", reporters=[Recorder(arguments.output)])
 simulation.run()
 
-with Record(options.output) as record:
+with Record(arguments.output) as record:
     swum = np.linalg.norm(record.body_position[-1] - record.body_position[0])
     turns = record.motor_angle[-1] / (2 * np.pi)
     theta = record.observables["phase_difference"]

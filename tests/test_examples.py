@@ -66,3 +66,6 @@ def test_swim_reads_what_it_recorded(tmp_path):
     with Record(tmp_path / "run.h5") as record:
         assert record.frame_count == 41
         assert f"phase difference {record.observables['phase_difference'][0]:.3f}" in said
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        script("swim.py", "4e-5", cwd=tmp_path)
+    assert "run.h5: exists already" in refused.value.stderr and "Traceback" not in refused.value.stderr

@@ -94,6 +94,11 @@ def plot(options: argparse.Namespace) -> int:
     os.environ["MPLBACKEND"] = "agg"  # a notebook's own, which a command started there inherits, may not exist here
     from warpflag.view import figures, sweep_figures
 
+    for path in options.directories:
+        folder = os.path.dirname(path)
+        if os.path.isfile(path) and sweep_figures.is_sweep(folder):  # DIR/* names a sweep's own files, too
+            told = f"the sweep: warpflag plot {folder}; its runs side by side: warpflag plot {folder}/0*"
+            return tell(f"{path}: is no run directory; {told}", _BAD_INPUT)
     if sweep_figures.is_sweep(options.directories[0]):
         figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
         print(options.output)

@@ -111,6 +111,9 @@ def test_a_short_peak_does_not_flatten_the_rest_and_is_told(tmp_path):
     axes = next(axes for title, axes in panels_of(figures.dashboard(run)).items() if title.startswith("motor"))
     assert 10.0 < axes.get_ylim()[1] < 20.0
     assert axes.get_title(loc="right") == "up to 5000"
+    run.curves["motor_rate"].values[:] = 0.0
+    axes = next(axes for title, axes in panels_of(figures.dashboard(run)).items() if title.startswith("motor"))
+    assert axes.get_title(loc="right") == "zero throughout" and -0.1 < axes.get_ylim()[0] < 0.0
 
 
 @pytest.mark.parametrize(

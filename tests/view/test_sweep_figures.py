@@ -119,6 +119,9 @@ def test_the_command_draws_what_it_was_asked_for(line, grid, tmp_path, capsys):
         path.unlink()
     assert cli.main(["plot", str(line), str(grid), "-o", str(tmp_path / "x.png")]) == 2
     assert "draws one sweep" in capsys.readouterr().err
+    assert cli.main(["plot", str(line / "table.csv"), "-o", str(tmp_path / "x.png")]) == 2  # one of runs/sweep/*
+    said = capsys.readouterr().err
+    assert f"warpflag plot {line};" in said and f"warpflag plot {line}/0*" in said and said.count("\n") == 1
 
 
 def test_an_empty_or_missing_table_is_refused(line):

@@ -236,7 +236,9 @@ class Recorder:
 
     def _refuse_existing(self) -> None:
         if self.path.exists():
-            raise RecordError(f"{self.path}: exists already")
+            raise RecordError(
+                f"{self.path}: exists already, and records are never overwritten; name another or remove it"
+            )
 
     def _create(self, values: dict[str, Any]) -> None:
         """Makes the file with its first frame, in memory and then under a temporary name: it is never there in part.

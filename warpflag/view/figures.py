@@ -277,7 +277,9 @@ def _set_range(axes: Any, found: Sequence[Curve]) -> None:
         beyond, high = [f"up to {_short(high)}"], most_high
     if low < _PEAK * most_low < 0.0:
         beyond, low = [*beyond, f"down to {_short(low)}"], most_low
-    margin = 0.05 * (high - low) or 0.5
+    if high == low:
+        beyond, high = ["zero throughout"], 1.0
+    margin = 0.05 * (high - low)
     axes.set_ylim(low - margin if low < 0.0 else -0.4 * margin, high + margin)
     if beyond:
         axes.set_title(", ".join(beyond), loc="right", fontsize=7)

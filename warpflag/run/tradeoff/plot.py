@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from warpflag.run.tradeoff.compared import Summary, front
 from warpflag.view import figures
@@ -24,11 +25,20 @@ def draw(found: Sequence[Summary], title: str, path: Path) -> None:
     with figures.styled() as figure_of:
         figure = figure_of(figsize=(0.8 * figures.TWO_COLUMNS, 3.0), layout="constrained")
         axis = figure.subplots()
+        shown = [s for s in found if _kind(s) and not math.isnan(s.error) and s.error > 0]
+        most = max((s.windows for s in found), default=0)
         for k, (kind, mark) in enumerate(_MARKS.items()):
-            own = [s for s in found if _kind(s) == kind and not math.isnan(s.error) and s.error > 0]
-            if own:
-                errors, costs = [s.error for s in own], [s.cost for s in own]
-                axis.plot(errors, costs, mark, ms=4, label=kind, color=figures.COLORS[k])
+            label, color = kind, figures.COLORS[k]
+            for everywhere in (True, False):
+                own = [s for s in shown if _kind(s) == kind and (s.windows == most) == everywhere]
+                if own:
+                    face = color if everywhere else "none"
+                    axis.plot(
+                        [s.error for s in own], [s.cost for s in own], mark, ms=4, mfc=face, mec=color, label=label
+                    )
+                    label = None
+        if any(s.windows < most for s in shown):
+            axis.plot([], [], "o", ms=4, mfc="none", mec="0.3", label="not in all windows")
         best = front(found)
         axis.plot([s.error for s in best], [s.cost for s in best], "-", lw=0.8, color="0.5", zorder=0, label="front")
         for k, s in enumerate(best):
@@ -39,10 +49,23 @@ def draw(found: Sequence[Summary], title: str, path: Path) -> None:
         axis.set_ylabel("computing per simulated ms [ms]")
         axis.set_title(title, loc="left")
         axis.margins(0.1, 0.15)
+        for side, values in ((axis.xaxis, [s.error for s in shown]), (axis.yaxis, [s.cost for s in shown])):
+            _set_ticks(side, values)
         names = "\n".join(f"{k + 1}  {s.choice}" for k, s in enumerate(best))
         axis.text(1.03, 0.0, names, transform=axis.transAxes, va="bottom", fontsize=7)
         axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.02))
         figures.save(figure, str(path))
+
+
+def _set_ticks(side: Any, values: Sequence[float]) -> None:
+    """Ticks of a logarithmic axis with plain numbers: at decades, at 1, 2 and 5 of them, or evenly within one."""
+    from matplotlib.ticker import AutoLocator, LogLocator, NullLocator, StrMethodFormatter
+
+    span = max(values) / min(values) if values else 1.0
+    subs = (1.0,) if span > 100.0 else (1.0, 2.0, 5.0)
+    side.set_major_locator(LogLocator(subs=subs) if span > 10.0 else AutoLocator())
+    side.set_minor_locator(NullLocator())
+    side.set_major_formatter(StrMethodFormatter("{x:g}"))
 
 
 def _kind(s: Summary) -> str:
