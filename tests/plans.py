@@ -1,4 +1,4 @@
-"""Plans for tests: how a GPU executes a scene, on a CPU too, and how a CPU cuts its launches."""
+"""Plans for tests: how a GPU executes a scene, on a CPU too, and how a CPU does with one thread for every element."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def plan(scene: Scene, device: Any, **choices: Any) -> Plan:
 
 
 def by_elements(own: Plan, **choices: Any) -> Plan:
-    """The same launches cut by elements, every chain by one thread, pairs gathered by one thread."""
+    """One thread for every element, every chain by one thread, pairs gathered by one thread."""
     pairs = "none" if own.pair_sum == "none" else "thread"
     forms = {"launch": "elements", "pair_sum": pairs, "step_pairs": "gathered", "chains": "serial"}
     return dataclasses.replace(own, **{**forms, **choices})
 
 
 def as_on_gpu(own: Plan, block: int = BLOCK) -> Plan:
-    """The forms of a GPU: a warp gathers the pairs of a node, a block solves the contacts of a cell."""
+    """As on a GPU: a warp gathers the pairs of a node, a block solves the contacts of a cell."""
     pairs = "none" if own.pair_sum == "none" else "warp"
     return by_elements(own, pair_sum=pairs, contact_block=block)

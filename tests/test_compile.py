@@ -80,7 +80,7 @@ def launched(
 ) -> set[Any]:
     """Kernels that a run of this kind launches, without compiling or running one.
 
-    by_cells: cut as for a CPU.
+    by_cells: whether one thread takes a whole cell, as on a CPU.
     """
     kernels = set()
     controlled = {} if stepper == "euler" or "fluid.temperature" in switches else {"numerics.accuracy": 1e-3}

@@ -16,8 +16,8 @@ ROOT = DRIVER.parent
 PYTHON = [
     path for folder in (DRIVER, KERNELS, ROOT / "tests", ROOT / "examples") for path in sorted(folder.rglob("*.py"))
 ]
-# From the bottom up: a room imports from itself and from those before it.
-ROOMS = {
+# From the bottom up: a folder imports from itself and from those before it.
+FOLDERS = {
     "warpflag_kernels": ("base", "rod", "contact", "fluid", "motor", "stepping", "implicit", "thermal"),
     "warpflag": (
         *("base", "scene", "record", "observables", "model", "stepping", "view", "run"),
@@ -62,7 +62,7 @@ def imports(path: Path, top_level: bool) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module)
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return {name for name in found if name.partition(".")[0] in ROOMS}
+    return {name for name in found if name.partition(".")[0] in FOLDERS}
 
 
 FILES = [path for path in PYTHON if DRIVER in path.parents or KERNELS in path.parents]
@@ -71,21 +71,21 @@ FILES = [path for path in PYTHON if DRIVER in path.parents or KERNELS in path.pa
 @pytest.mark.parametrize("path", FILES, ids=lambda path: module_of(path))
 def test_imports_point_down(path):
     package, _, rest = module_of(path).partition(".")
-    own, order = rest.partition(".")[0], ROOMS[package]
+    own, order = rest.partition(".")[0], FOLDERS[package]
     if own not in order:
         assert own in ("", "picture")  # the package itself; pictures stand alone
         return
     for name in imports(path, top_level=False):
         target, _, inner = name.partition(".")
-        room = inner.partition(".")[0]
+        folder = inner.partition(".")[0]
         assert (package, target) != ("warpflag_kernels", "warpflag"), f"a kernel imports the driver: {name}"
-        if target == package and room in order:
-            assert order.index(room) <= order.index(own), f"{own} imports {name}"
-        assert target != package or own == room or room != "picture", f"{own} imports {name}"
+        if target == package and folder in order:
+            assert order.index(folder) <= order.index(own), f"{own} imports {name}"
+        assert target != package or own == folder or folder != "picture", f"{own} imports {name}"
 
 
 def test_imports_run_in_no_circle():
-    # A room's face names its files; that these import the room's other files is no circle.
+    # An `__init__` passes on what its folder's files define; that these import each other is no circle.
     files = [path for path in FILES if path.name != "__init__.py"]
     modules = {module_of(path): imports(path, top_level=True) for path in files}
     graph = {name: {other for other in found if other in modules and other != name} for name, found in modules.items()}
@@ -141,7 +141,7 @@ def cpp_written(function: FUNCTION, folder: Path) -> set[str]:
 def origins(tree: ast.Module, own: str) -> dict[str, tuple[str, str]]:
     """Where device functions come from that a file calls by a local name: (file, name there).
 
-    Follows `a, b = rooms_file.functions(p).a, other.functions(p).b` and `f = rooms_file.functions(p)`.
+    Follows `a, b = file.functions(p).a, other.functions(p).b` and `f = file.functions(p)`.
     """
     files: dict[str, str] = {}  # of names that stand for a file or for functions from it
     found: dict[str, tuple[str, str]] = {}

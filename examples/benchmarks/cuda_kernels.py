@@ -58,9 +58,9 @@ def collected() -> Iterator[set[Any]]:
 
 
 def as_on_gpu(own: Plan) -> Plan:
-    """The forms of a GPU, on the plan's own device."""
-    forms = {"launch": "elements", "pair_sum": "warp", "step_pairs": "gathered", "chains": "serial"}
-    return dataclasses.replace(own, contact_block=CONTACT_BLOCK, **forms)
+    """As on a GPU, on the plan's own device."""
+    ways = {"launch": "elements", "pair_sum": "warp", "step_pairs": "gathered", "chains": "serial"}
+    return dataclasses.replace(own, contact_block=CONTACT_BLOCK, **ways)
 
 
 def launched(precision: str, stepper: str) -> set[Any]:

@@ -5,8 +5,8 @@
 
 A run replays one captured pass. The RKC stepper chooses the point at which to evaluate next: a stage of its step, or a
 probe of the spectral radius. The chart places nodes and directors there, the right-hand side turns them into forces
-and velocities, the chart turns those into rates of its increments, and the stepper keeps them and moves its clockwork
-on. A pass that ends a step looks at the guards, judges the error and commits the state besides. So a pass is one
+and velocities, the chart turns those into rates of its increments, and the stepper keeps them and goes on to its next
+stage. A pass that ends a step looks at the guards, judges the error and commits the state besides. So a pass is one
 right-hand side and what it takes to be part of a step.
 
 Each row is replayed alone, many times over in a captured loop, at the start of the scene and amid its contacts (5.5 ms

@@ -61,7 +61,7 @@ class Cells:
         return np.hstack([self.data.steric_first.numpy(), self.data.steric_second.numpy(), magnitude.numpy()[:, None]])
 
     def forces_without_lists(self) -> np.ndarray:
-        """The same with every segment asking all others, as one in a crowd does."""
+        """The same with every segment tested against all others, as where a list has no room."""
         count = self.near.count.numpy().copy()
         self.near.count.fill_(-1)
         found = self.forces()
@@ -73,7 +73,7 @@ class Cells:
         count, segment = self.near.count.numpy(), self.near.segment.numpy().reshape(-1, neighbours.SLOTS)
         return [segment[e, : count[e]].tolist() for e in range(len(count))]
 
-    def neighbourly(self, x: np.ndarray) -> list[set[int]]:
+    def expected_neighbours(self, x: np.ndarray) -> list[set[int]]:
         """Segments of other flagella of the cell that contact or its search can ask for, by segment."""
         found: list[set[int]] = [set() for _ in x]
         for c in range(self.model.cell_count):
@@ -113,7 +113,7 @@ def test_whatever_can_be_near_is_listed_until_a_node_has_moved_by_half_the_skin(
     longest = [max(len(lists[e]) for e in b.segments[b.cell[b.segments] == c]) for c in range(5)]
     assert 0 < longest[1] < 10 and 0 < longest[0] < 20
     random, new = np.random.default_rng(1), 0
-    at_first = b.neighbourly(b.start)
+    at_first = b.expected_neighbours(b.start)
     for distance in (0.25 * HALF, 0.5 * HALF, 0.95 * HALF):
         for _ in range(4):
             x = b.start + b.drift(distance) + jitter(random, len(b.start), 0.99 * HALF - distance)
@@ -121,7 +121,7 @@ def test_whatever_can_be_near_is_listed_until_a_node_has_moved_by_half_the_skin(
             with_lists = b.forces()
             assert np.array_equal(with_lists, b.forces_without_lists())
             assert b.lists() == lists and np.array_equal(b.built_at(), built)
-            for e, near in enumerate(b.neighbourly(x)):
+            for e, near in enumerate(b.expected_neighbours(x)):
                 assert near <= set(lists[e])
                 new += len(near - at_first[e])
     assert new > 50
@@ -188,7 +188,7 @@ def test_lists_made_of_what_is_not_a_number_do_not_last(broken, device, precisio
     assert np.abs(expected[3]).max() > 0.0 or np.abs(expected[30]).max() > 0.0
 
 
-def test_a_crowd_too_large_for_a_list_asks_everyone(device, precision):
+def test_a_crowd_too_large_for_a_list_is_tested_in_full(device, precision):
     """Eight fine filaments side by side: more near segments than a list holds, though not at their ends."""
     values: dict[str, Any] = {"flagella.count": 8, "flagella.segment_length": 0.025, "flagella.length": 1.5}
     values |= {f"flagellum.{k}.azimuth": 5.0 * k for k in range(8)}

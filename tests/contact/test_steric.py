@@ -73,7 +73,7 @@ def test_force_law_and_its_linear_continuation(precision, device):
     assert np.abs(body).max() == 0.0
 
 
-def test_force_acts_at_the_lever(precision, device):
+def test_force_acts_at_the_closest_points(precision, device):
     """(1 - s) of it on the first node of a segment and s on the second, the opposite on the other flagellum."""
     scene = cell(FOUR, precision)
     s, t = 0.3, 0.8

@@ -93,7 +93,7 @@ def constrained(whole: np.ndarray, held: list[int]) -> np.ndarray:
 
 @pytest.mark.parametrize("switch", ["free", "translation", "anchored"])
 def test_the_mobility_is_that_of_a_rigid_shell(switch, precision, device, monkeypatch):
-    """Against a dense solution of the constraint, cut as for a CPU and as for a GPU; a held body obstructs the flow."""
+    """Against a dense solution of the constraint, as on a CPU and as on a GPU; a held body obstructs the flow, too."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     values = {"translation": {"body.translation": False}, "anchored": {"body.anchored": True}}.get(switch, {})
     scene = touching_cell({**ON, "flagella.length": 1.0, "fluid.viscosity": 0.7e-3, **values}, precision)

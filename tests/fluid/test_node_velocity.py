@@ -224,7 +224,7 @@ def velocities(scenes: list, plan: Plan, forces: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("pairs", ["same", "float32"])
 @pytest.mark.parametrize("mode", ["within", "between", "all"])
-def test_every_form_of_the_pair_sum_gives_the_same(mode, pairs, precision, device, monkeypatch):
+def test_every_way_to_the_pair_sum_gives_the_same(mode, pairs, precision, device, monkeypatch):
     """Every pair once for both nodes, as one thread of a CPU does it, or gathered at each, by a thread or by a warp; a
     CPU's fibers stand for the warp's threads."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)

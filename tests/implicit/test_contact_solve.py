@@ -64,12 +64,12 @@ NO_STERIC = {"no steric": {"steric.enabled": False}}  # the body alone, beside f
 
 
 @pytest.mark.parametrize("name", [*CELLS, *NO_STERIC])
-def test_a_load_is_answered_as_by_dense_matrices(name, device, precision):
+def test_products_are_those_of_dense_matrices(name, device, precision):
     """W lambda and Y lambda. With every gap open and -lambda acting, the first evaluation applies W to lambda."""
     check_answers(listed(touching({**CELLS, **NO_STERIC}[name], precision, device, seed=0)), precision)
 
 
-def test_a_load_is_answered_where_contacts_are_few(device, precision):
+def test_products_where_contacts_are_few(device, precision):
     """Nodes that only the segment after them loads, and nodes without any load."""
     b = touching({"body.contact": False}, precision, device, seed=0, separation=0.061)
     l = listed(b)
@@ -190,7 +190,7 @@ def test_what_cannot_be_solved_is_reported(name, device, precision):
 
 @pytest.mark.parametrize("name", ["all", "three", "bundle", "anchored", "no body contact"])
 def test_what_one_solution_tells_serves_the_next(name, device, precision):
-    """Pressed on, contacts are solved again: to the same law, with fewer products than by who knows nothing."""
+    """Pressed further together, contacts are solved again: to the same law, with fewer products than from nothing."""
     solved, products = [], []
     for anew in (True, False):
         l = listed(touching(CELLS[name], precision, device, seed=0), tolerance=1e-4 * SIGMA)

@@ -36,7 +36,7 @@ def launches(scene: Scene, monkeypatch: pytest.MonkeyPatch, by_cells: bool = Fal
     Args:
         scene: of the simulation.
         monkeypatch: puts a recorder in place of Warp's launch.
-        by_cells: cut as for a CPU, else by stages, as for a GPU.
+        by_cells: whether one thread takes a whole cell, as on a CPU; else stage by stage, as on a GPU.
     """
     kernels: list[Any] = []
     own = plan(scene, "cpu")

@@ -1,7 +1,8 @@
 """Step control: the accuracy asked for is the accuracy reached, at switch-on, in contact and after jumps; what can't be
 stepped ends with a reason.
 
-Windows and their starts are those of `tests.test_implicit`. Both steppers that estimate an error obey the same control.
+Windows and their starts are those of `tests.implicit.test_implicit`. Both steppers that estimate an error obey the same
+control.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""Devices, output files, text streams, the progress line and rotations, which all other rooms use."""
+"""Devices, output files, text streams, the progress line and rotations, which all other folders use."""

@@ -1,4 +1,4 @@
-"""Methods whose bodies live in a room above: how a record or a scene shows itself in a notebook.
+"""Methods whose bodies stand in a folder above: how a record or a scene shows itself in a notebook.
 
 Imports only point down, so such a method names its function, which is loaded when it is called.
 """

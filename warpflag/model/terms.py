@@ -61,7 +61,7 @@ def _plain(scene: Scene) -> bool:
 
 
 def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
-    _fill_motor(scenes, precision, device, data)  # what the hook's stiffening goes by
+    _fill_motor(scenes, precision, device, data)  # a hook that stiffens reads the torque
     curves, tables = [], []
     specs = [(scene, k, spec) for scene in scenes for k, spec in enumerate(scene.resolved_flagella())]
     for scene, k, spec in specs:

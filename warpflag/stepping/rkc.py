@@ -1,4 +1,4 @@
-"""Runge-Kutta-Chebyshev stepping (and Euler, its one-stage form) of every cell of a system."""
+"""Runge-Kutta-Chebyshev stepping (and Euler, its one-stage case) of every cell of a system."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""How a run is executed: every choice between forms of the same calculation, made once.
+"""How a run is executed: every choice between ways to make the same calculation, made once.
 
-The forms of a stage give the same numbers to round-off. A CPU works through the threads of a launch one after the
+All ways give the same numbers to round-off. A CPU works through the threads of a launch one after the
 other, so one thread takes a whole cell, every pair of nodes once, and several flagella in the lanes of a vector
 register. A GPU has threads to spare: one for every element, a warp for the pairs of a node, a block for the contacts
-of a cell. The strict build is cut as for a GPU, and so is its CPU code, for comparisons to the last bit.
+of a cell. A strict build on a CPU takes launches and sums as a GPU does, for comparisons to the last bit.
 """
 
 from dataclasses import dataclass
@@ -103,7 +103,7 @@ class Plan:
         contact_block: threads that solve the contacts of one cell.
 
     Raises:
-        ValueError: a form is not known, or does not go with another one.
+        ValueError: a choice is not known, or does not go with another one.
     """
 
     device: Any
@@ -122,9 +122,9 @@ class Plan:
             "step_pairs": ("stored", "symmetric", "gathered"),
             "chains": ("simd", "serial"),
         }
-        for name, forms in allowed.items():
-            if getattr(self, name) not in forms:
-                raise ValueError(f"plan: {name} is one of {', '.join(forms)}, not {getattr(self, name)!r}")
+        for name, known in allowed.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"plan: {name} is one of {', '.join(known)}, not {getattr(self, name)!r}")
         if "symmetric" in (self.pair_sum, self.step_pairs) and self.launch != "cells":
             raise ValueError("plan: a symmetric pair sum needs one thread per cell, launch = 'cells'")
         if self.step_pairs == "stored" and self.launch != "cells":
@@ -153,8 +153,8 @@ class Plan:
         if self.pair_sum != "none":
             sums = f"{self.pair_sum} pair sum{pairs}, {self.step_pairs} within an implicit step"
         block = "one thread" if self.contact_block == 1 else f"blocks of {self.contact_block} threads"
-        forms = f"{launch}, {sums}, {self.chains} chains, contacts by {block}"
-        return f"{self.device.alias}, {self.precision.name}, {build}: {forms}"
+        ways = f"{launch}, {sums}, {self.chains} chains, contacts by {block}"
+        return f"{self.device.alias}, {self.precision.name}, {build}: {ways}"
 
 
 def choose_plan(device: Any, precision: Precision, switches: Switches, largest_cell: int) -> Plan:

@@ -205,7 +205,7 @@ class DeviceModel:
         cell_count, flagellum_count, element_count: sizes C, K, E.
         data: the struct `Model`.
         groups: the struct `Groups`: flagella side by side in vector lanes.
-        shells: beads of the bodies on the host, `warpflag_kernels.fluid.body_flow.Shells`; None without body flow.
+        shells: beads of the bodies on the host, `warpflag_kernels.fluid.shell.Shells`; None without body flow.
     """
 
     plan: Plan

@@ -36,11 +36,11 @@ def local(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
+def functions(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> SimpleNamespace:
     """Device functions: velocities of one node, and of all nodes of a cell."""
     Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
-    module = p.module("mobility_functions", _variant(p, pair, flows, form))
-    sums = rotne_prager.functions(p, pair, flows, form)
+    module = p.module("mobility_functions", _variant(p, pair, flows, pair_sum))
+    sums = rotne_prager.functions(p, pair, flows, pair_sum)
     add_cell, flow_at = sums.add_cell, sums.flow_at
 
     drag_velocity = local(p).drag_velocity
@@ -64,7 +64,7 @@ def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleN
     @wp.func(module=module)
     def move_cell(model: Model, state: State, s: PairSum, c: wp.int32):
         """Velocities of all nodes of cell c."""
-        if wp.static(form == "symmetric"):
+        if wp.static(pair_sum == "symmetric"):
             add_cell(model, state, s, c)
         e = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
@@ -76,12 +76,12 @@ def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleN
 
 
 @functools.cache
-def _kernels(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
+def _kernels(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> SimpleNamespace:
     vec3, real = p.vec3, pair.real
     Model, State, PairSum = structs(p).Model, structs(p).State, rotne_prager.struct(pair)
-    f = functions(p, pair, flows, form)
+    f = functions(p, pair, flows, pair_sum)
     move_node, move_cell = f.move_node, f.move_cell
-    module = p.module("mobility", _variant(p, pair, flows, form))
+    module = p.module("mobility", _variant(p, pair, flows, pair_sum))
 
     @wp.kernel(module=module)
     def pack(
@@ -119,7 +119,7 @@ def _kernels(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNa
             move_node(model, state, s, e, model.flagellum_of[e], c, thread)
 
     kernels = SimpleNamespace(pack=pack, velocities=velocities)
-    if form == "symmetric":  # elsewhere it need not be compiled
+    if pair_sum == "symmetric":  # elsewhere it need not be compiled
 
         @wp.kernel(module=module)
         def by_cells(
@@ -137,8 +137,8 @@ def _kernels(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNa
     return kernels
 
 
-def _variant(p: Precision, pair: Precision, flows: Flows, form: str) -> str:
-    return "_".join([flows.variant, form, *["short"] * (pair != p)])
+def _variant(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> str:
+    return "_".join([flows.variant, pair_sum, *["short"] * (pair != p)])
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:

@@ -2,7 +2,7 @@
 
 By the fluctuation-dissipation theorem a step of length dt adds the velocity (2 kT/dt)^1/2 M^1/2 xi, xi normal deviates.
 M = S + R is drawn in two independent parts. R is the Rotne-Prager sum with its self term (`lanczos`). S is what the
-local mobility has beyond that self term, block-diagonal in nodes, so its root is closed:
+local mobility has beyond that self term, block-diagonal in nodes, so its root has a closed form:
 
     S^1/2 xi = s_along^1/2 t (t.xi) + s_across^1/2 (xi - t (t.xi)),    s = mobility - 1/(6 pi eta a)
 

@@ -116,20 +116,20 @@ def over_warp(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, pair: Precision, flows: Flows, form: str) -> SimpleNamespace:
+def functions(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> SimpleNamespace:
     """Device functions: the symmetric sum of a cell, and the flow at a node in units of 1/(8 pi eta).
 
     Args:
         p: precision of the run.
         pair: precision of the terms.
         flows: which nodes are coupled, but not "none".
-        form: `Plan.pair_sum`: "symmetric", "warp" or "thread".
+        pair_sum: `Plan.pair_sum`: "symmetric", "warp" or "thread".
     """
     vec3, real, short = p.vec3, pair.real, pair != p  # vectors of the run, numbers of its pairs
     Model, State, PairSum = structs(p).Model, structs(p).State, struct(pair)
-    module = p.module("pair_sum", "_".join([flows.variant, form, *["short"] * short]))
+    module = p.module("pair_sum", "_".join([flows.variant, pair_sum, *["short"] * short]))
     within, between = flows.within, flows.between
-    symmetric, threads = form == "symmetric", WARP if form == "warp" else 1
+    symmetric, threads = pair_sum == "symmetric", WARP if pair_sum == "warp" else 1
     row = rows(pair, flows.unequal, threads)
     add_row, gather_pairs, warp_sum = row.add_row, row.gather_pairs, over_warp(p)
 

@@ -15,7 +15,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel
 
 LANES = 16  # beads are filled up to multiples of this: lanes of the widest register in float32
-FAR = 1.0e3  # where beads without load lie, in body lengths or so [um]
+FAR = 1.0e3  # coordinate of beads without load [um]: a thousand times the body, so that they reach nothing
 
 
 @dataclass(frozen=True)

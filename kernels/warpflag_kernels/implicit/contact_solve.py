@@ -38,14 +38,14 @@ DEEPEST = 0.9  # predicted gaps are taken to be at least this [sigma]: forces of
 
 
 @functools.cache
-def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -> SimpleNamespace:
+def _kernels(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: int) -> SimpleNamespace:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
     Flow, Increment = flow_stage.struct(p), chain_chart.types(p).Increment
     steric_force = steric.functions(p).steric_force
     gap_change = contact_list.functions(p).gap_change
-    product = delassus.functions(p, flows, form, chains, threads).product
+    product = delassus.functions(p, flows, step_pairs, chains, threads).product
     block_sum, block_max = delassus.reductions(p, threads).block_sum, delassus.reductions(p, threads).block_max
     loops = contact_loops.functions(p, threads)
     load_all, take, leave, solve_single = loops.load_all, loops.take, loops.leave, loops.solve_single
@@ -54,7 +54,7 @@ def _kernels(p: Precision, flows: Flows, form: str, chains: str, threads: int) -
     iterations, deep = wp.constant(ITERATIONS), wp.constant(real(DEEP))
     deepest, per_drag = wp.constant(real(DEEPEST)), wp.constant(real(DIAGONAL_PER_DRAG))
     infinite = wp.constant(real(3.0e38))
-    module = p.module("contact_solve", f"{flows.variant}_{form}_{chains}_{threads}")
+    module = p.module("contact_solve", f"{flows.variant}_{step_pairs}_{chains}_{threads}")
 
     @wp.kernel(module=module)
     def warm_start(

@@ -137,13 +137,13 @@ def reductions(p: Precision, threads: int) -> SimpleNamespace:
 
 
 @functools.cache
-def functions(p: Precision, flows: Flows, form: str, chains: str, threads: int) -> SimpleNamespace:
+def functions(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: int) -> SimpleNamespace:
     """Device functions of one block of so many threads: sums and maxima over them, and the product."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
     Flow, vec6 = flow_stage.struct(p), chain_chart.types(p).vec6
-    sums = flow_stage.functions(p, flows, form)
+    sums = flow_stage.functions(p, flows, step_pairs)
     load, spread, flow_at, loaded_end = sums.load, sums.spread, sums.flow_at, sums.loaded_end
     band_functions, body_rate = block_band.functions(p), body_coupling.functions(p).body_rate
     drag, solve_flagellum = band_functions.drag, band_functions.solve_flagellum
@@ -151,11 +151,11 @@ def functions(p: Precision, flows: Flows, form: str, chains: str, threads: int) 
     jacobian = contact_list.functions(p)
     gap_change, body_load = jacobian.gap_change, jacobian.body_load
     segment_loads, node_loads = jacobian.segment_loads, jacobian.node_loads
-    stored = form != "gathered"
+    stored = step_pairs != "gathered"
     beads = body_flow.functions(p, p.single, stored)
     axes_of, pull, answer, bead_flow = beads.axes_of, beads.pull, beads.answer, beads.flow_at_bead
     hold_row, sum_loads, load_rows, flow_at_node = beads.hold_row, beads.sum_loads, beads.load_rows, beads.flow_at_node
-    module = p.module("delassus", f"{flows.variant}_{form}_{chains}_{threads}")
+    module = p.module("delassus", f"{flows.variant}_{step_pairs}_{chains}_{threads}")
 
     @wp.func(module=module)
     def held(flow: Flow, c: wp.int32):
@@ -256,7 +256,7 @@ def functions(p: Precision, flows: Flows, form: str, chains: str, threads: int) 
                     load(flow, flow.slot[e], law.on_node[e])
                 e += threads
         meet()
-        if wp.static(form != "gathered"):
+        if wp.static(step_pairs != "gathered"):
             spread(model, flow, c, loaded_end(model, flow, c))
         if wp.static(flows.body):
             load_beads(model, state, contacts_in, flow, law, c, thread)

@@ -87,7 +87,14 @@ def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def law_of(
-        model: Model, band: Band, motors: MotorSolve, k: wp.int32, c: wp.int32, drive: real, mobility: real, load: real
+        model: Model,
+        band: Band,
+        motors: MotorSolve,
+        k: wp.int32,
+        c: wp.int32,
+        drive: real,
+        mobility: real,
+        passive_rate: real,
     ):
         """`settled` of motor k, by its average rate if the law asks for that."""
         share = one
@@ -95,7 +102,7 @@ def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
         if model.motor.prescribed[k] == 0:
             share = share_of(band, motors, c)
             known = (one - share) * motors.average[k]
-        torque, softness, slope = settled(model, k, drive, share * mobility, share * load + known)
+        torque, softness, slope = settled(model, k, drive, share * mobility, share * passive_rate + known)
         return torque, share * softness, slope
 
     @wp.kernel(module=module)
@@ -110,10 +117,10 @@ def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
         e = wp.tid()
         if state.active[model.cell_of[e]] == 0:
             return
-        load = vec4(real(0.0))
+        unit = vec4(real(0.0))
         if e == model.first_node[model.flagellum_of[e]]:
-            load[3] = real(1.0)
-        motors.answer.node[e] = load
+            unit[3] = real(1.0)
+        motors.answer.node[e] = unit
 
     @wp.kernel(module=module)
     def couple(
@@ -183,12 +190,12 @@ def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
             while k < end:
                 mobility = per_step * motors.answer.node[model.first_node[k]][3]
                 free = motors.free_rate[k] + per_step * wp.dot(motors.by_body[k], moved)
-                load = free - mobility * state.motor.held[k]
+                passive_rate = free - mobility * state.motor.held[k]
                 drive = drive_at(model, k, state.time[c])
                 if wp.static(averaged):
-                    torque, softness, slope = law_of(model, band, motors, k, c, drive, mobility, load)
+                    torque, softness, slope = law_of(model, band, motors, k, c, drive, mobility, passive_rate)
                 else:
-                    torque, softness, slope = settled(model, k, drive, mobility, load)
+                    torque, softness, slope = settled(model, k, drive, mobility, passive_rate)
                 if slope != state.motor.slope[k]:
                     changed = True
                 state.motor.slope[k] = slope

@@ -223,8 +223,9 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
             flexible = weak or (crowd and not rod_like(model, c, step[c]))
             kappa = ratio * over_implicit[c]
-            # Of cells measured rarely the first product only turns the probe: of a vector of any direction it tells
-            # nothing. The others are solved in full until their probe has turned.
+            # The first product, of a probe of any direction, may exceed kappa by far. Cells measured rarely do not use
+            # it: it only turns the probe toward the leading eigenvector. The others use it, and so are solved with the
+            # full mobility until their probe has turned.
             if stability.kappa[c] > wp.float64(0.0) or not weak:
                 most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
                 stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)

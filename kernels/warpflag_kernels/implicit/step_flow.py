@@ -64,7 +64,7 @@ def rows(p: Precision) -> Any:
 
 
 @functools.cache
-def functions(p: Precision, flows: Flows, form: str, threads: int = 1) -> SimpleNamespace:
+def functions(p: Precision, flows: Flows, step_pairs: str, threads: int = 1) -> SimpleNamespace:
     """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
     `spread` where pairs are taken once, then `flow_at` any node; for one `Plan.step_pairs`. Threads: those
     that share what is gathered at a node, one or those of a warp."""
@@ -75,8 +75,8 @@ def functions(p: Precision, flows: Flows, form: str, threads: int = 1) -> Simple
     add_row, gather_pairs, warp_sum = row.add_row, row.gather_pairs, rotne_prager.over_warp(single)
     within, between = flows.within, flows.between
     zero = wp.constant(single.real(0.0))
-    symmetric, stored = form != "gathered", form == "stored"
-    module = p.module("flow_functions", f"{flows.variant}_{form}_{threads}")
+    symmetric, stored = step_pairs != "gathered", step_pairs == "stored"
+    module = p.module("flow_functions", f"{flows.variant}_{step_pairs}_{threads}")
 
     @wp.func(module=module)
     def load(flow: Flow, slot: wp.int32, f: vec3):
@@ -304,14 +304,14 @@ def allocate(model: DeviceModel) -> Any:
     flow.loaded, flow.start, flow.first_other = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
     flow.node = zeros(model.element_count, wp.int32)
     flow.slot = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
-    form = model.plan.step_pairs
-    results = () if form == "gathered" else ("ux", "uy", "uz")
+    step_pairs = model.plan.step_pairs
+    results = () if step_pairs == "gathered" else ("ux", "uy", "uz")
     for name in ("x", "y", "z", "fx", "fy", "fz", *results):
         setattr(flow.sum, name, zeros(model.element_count, wp.float32))
     if model.switches.flows.unequal:
         flow.sum.radius = zeros(model.element_count, wp.float32)
     flow.shell = shell_stage.allocate(model, model.precision.single)
-    if form == "stored":
+    if step_pairs == "stored":
         first_flagellum = model.data.first_flagellum.numpy()
         moving = np.diff(model.data.first_node.numpy()[first_flagellum]) - np.diff(first_flagellum)
         pairs = np.concatenate([[0], np.cumsum(moving * (moving - 1) // 2)])

@@ -53,8 +53,8 @@ def joint(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def axis_rates(model: Model, state: State, k: wp.int32):
-        """Rates of a beside m that is carried along by the minimal rotation of m onto a: by the segment vector, by its
-        spin, and by m (the carried rate, as the matrix that takes m's)."""
+        """First derivatives of a in the plane across it: by the vector of segment 1, by its spin, and by m, whose
+        changes the minimal rotation of m onto a takes there."""
         i = model.first_node[k]
         m = state.pose.tangent[i]
         t = state.pose.tangent[i + 1]
@@ -169,7 +169,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if c < real(0.0):
             along = s * q * (three * q - two) / (one - c * c)
         by_segment, by_spin, carried = axis_rates(model, state, k)
-        # Of the cosine.
+        # Derivatives of the cosine c.
         cosine_by_segment = wp.cross(p_, t) / length
         cosine_by_spin = wp.dot(p_, t)
         out.ee[i] = out.ee[i] + around * (wp.transpose(carried) * carried) + along * wp.outer(a, a)

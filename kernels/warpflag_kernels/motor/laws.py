@@ -77,13 +77,22 @@ def curves(p: Precision) -> SimpleNamespace:
         return turns, vec3(strength * wp.abs(curve[0]), curve[1], strength * curve[2])
 
     @wp.func(module=module)
-    def settled(model: Model, k: wp.int32, drive: real, mobility: real, load: real):
-        """Torque of motor k where Omega - mobility T(Omega) = load [rad/s]; how much it falls with the load; and the
-        slope of the piece of the curve that it is on, -1 for a prescribed rate."""
+    def settled(model: Model, k: wp.int32, drive: real, mobility: real, passive_rate: real):
+        """The torque of motor k that obeys its law.
+
+        Args:
+            drive: of the motor, from 1 to -1.
+            mobility: mu, change of the rate Omega by the torque [1/(pN um s)].
+            passive_rate: Omega without the motor's torque [rad/s], so that Omega = passive_rate + mobility T(Omega).
+
+        Returns:
+            the torque [pN um]; how much it falls with the passive rate [pN um s]; and the slope of the piece of the
+            curve that the motor is on [pN um s], -1 for a prescribed rate.
+        """
         if model.motor.prescribed[k] != 0:
-            return (drive * model.motor.rate[k] - load) / mobility, one / mobility, -one
+            return (drive * model.motor.rate[k] - passive_rate) / mobility, one / mobility, -one
         turns, curve = sense(model, k, drive)
-        own = turns * load
+        own = turns * passive_rate
         knee = curve[1]
         if own <= knee - mobility * curve[0]:
             return turns * curve[0], zero, zero
@@ -148,8 +157,9 @@ def _functions(p: Precision) -> SimpleNamespace:
                 first = model.first_node[k]
                 m = state.pose.tangent[first]
                 mobility = model.drag.spin_mobility[k]
-                load = mobility * state.spin_torque[first] - wp.dot(m, spin)
-                torque, softness, slope = settled(model, k, drive_at(model, k, state.time[c]), mobility, load)
+                passive_rate = mobility * state.spin_torque[first] - wp.dot(m, spin)
+                drive = drive_at(model, k, state.time[c])
+                torque, softness, slope = settled(model, k, drive, mobility, passive_rate)
                 if slope != state.motor.slope[k]:
                     changed = True
                 state.motor.slope[k] = slope

@@ -7,8 +7,8 @@ up. Joints near the root or the tip flip by themselves (nucleation) when their m
     m = -(A (Omega - Omega_p)) . Omega_p/|Omega_p|,     Omega_p: ground state of its form; other sign if of other hand,
 
 exceeds one threshold, and back when it falls below another; in a helix that is wound up uniformly it is the moment
-about the axis. Any joint flips beside one of the other form (propagation) at lower thresholds. There the local m would
-not do: a joint of semicoiled form amid the normal one has an eighth of it, and a kinked filament is bent by its
+about the axis. Any joint flips beside one of the other form (propagation) at lower thresholds. There the local m says
+little: a joint of semicoiled form amid the normal one has an eighth of it, and a kinked filament is bent by its
 thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels; near
 the ends over less, as much to either side, so that it is the moment at the joint.
 
@@ -184,7 +184,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             if now >= model.polymorphs.second[i][0] and now < model.polymorphs.second[i][1]:
                 goes_on = True
             i += 1
-        # Of the joint before, as it was: whether it has left form 0, 2 on its ramp or where there is none; its form.
+        # The joint before this one as it was when the step ended: `before` is 0 in form 0, 1 in another form, 2 on its
+        # ramp or where there is no joint; `form_before` is its form, 0 on its ramp, 2 at the root.
         before = int(2)
         form_before = int(2)
         e = root

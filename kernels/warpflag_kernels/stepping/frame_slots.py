@@ -88,7 +88,7 @@ class DenseOutput:
 
 
 def allocate(model: DeviceModel, state: DeviceState) -> DenseOutput:
-    """Empty slots, as many as memory is worth, and no frame wanted."""
+    """Empty slots, as many as `MOST_SLOTS` and `MOST_BYTES` allow, and no frame due."""
     p, device = model.precision, model.device
     cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
 

@@ -66,17 +66,17 @@ def _evaluators(p: Precision, terms: tuple[Term, ...]) -> tuple[Any, Any]:
 
 
 @functools.cache
-def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: Flows, form: str) -> Any:
+def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: Flows, pair_sum: str) -> Any:
     Model, State = structs(p).Model, structs(p).State
     PairSum, Neighbours, Shell = rotne_prager.struct(pair), neighbours.struct(p), shell_stage.struct(pair)
     evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
     gather, motion = forces.functions(p, terms).gather, body.functions(p, terms)
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
-    move_cell = node_velocity.functions(p, pair, flows, form).move_cell
+    move_cell = node_velocity.functions(p, pair, flows, pair_sum).move_cell
     beads = body_flow.functions(p, pair, stored=True)
     obstruct, carry = beads.obstruct, beads.carry
-    name = "_".join([variant(terms), flows.variant, form, *["short"] * (pair != p)])
+    name = "_".join([variant(terms), flows.variant, pair_sum, *["short"] * (pair != p)])
 
     @wp.kernel(module=p.module("whole_cell", name))
     def right_hand_side(

@@ -1,4 +1,4 @@
-"""Stabilised explicit stepping: Runge-Kutta-Chebyshev of second order (RKC2), and Euler as its one-stage form.
+"""Stabilised explicit stepping: Runge-Kutta-Chebyshev of second order (RKC2), and Euler as its one-stage case.
 
 Sommeijer, Shampine, Verwer, J. Comput. Appl. Math. 88, 315 (1997). With increments since the start of the step:
 
