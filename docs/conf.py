@@ -5,7 +5,9 @@ Built by `uv run --group docs sphinx-build -W -q docs docs/_build`.
 
 import ast
 import fnmatch
+import itertools
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from sphinx.util import logging
@@ -109,18 +111,44 @@ def drop_empty_patterns(app: object, docname: str, source: list[str]) -> None:
 
 
 def check_constants(_app: object) -> None:
-    """Warns of every named number of the kernels and steppers that numerics.md has no row for."""
+    """Warns of every named number without a reason: a row of numerics.md, or words beside it.
+
+    Those of the kernels and steppers, of the model and of the measures, which change results, need the row. For the
+    rest (buffers, intervals, pictures) some words do: a comment on its line or above it, or a docstring.
+    """
     here = Path(__file__).parent
     rows = (here / "numerics.md").read_text(encoding="utf-8")
-    files = [*(here / "../kernels/warpflag_kernels").rglob("*.py"), *(here / "../warpflag/stepping").glob("*.py")]
+    driver = here / "../warpflag"
+    of_results = [driver / folder for folder in ("stepping", "model", "observables", "scene")]
+    files = [*(here / "../kernels/warpflag_kernels").rglob("*.py"), *driver.rglob("*.py")]
     for path in sorted(files):
-        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-            targets = statement.targets if isinstance(statement, ast.Assign) else []
-            numeric = any(isinstance(x, ast.Constant) and type(x.value) in (int, float) for x in ast.walk(statement))
-            for name in (t.id for t in targets if isinstance(t, ast.Name)):
+        needs_row = driver not in path.parents or any(folder in path.parents for folder in of_results)
+        text = path.read_text(encoding="utf-8")
+        for names, words in numbers_of(text):
+            for name in names:
                 row = rf"^\|[^|]*\b{name}\b[^|]*\|[^|]*{path.parent.name}/{path.name}"
-                if name.isupper() and numeric and not re.search(row, rows, re.MULTILINE):
+                if not re.search(row, rows, re.MULTILINE) and (needs_row or len(words.split()) < 3):
                     logging.getLogger(__name__).warning("numerics.md has no row for %s of %s", name, path.name)
+
+
+def numbers_of(text: str) -> Iterator[tuple[list[str], str]]:
+    """Names of the numbers that a module defines, and the words that stand beside each definition."""
+    body, lines = ast.parse(text).body, text.splitlines()
+    for statement, after in itertools.zip_longest(body, body[1:]):
+        if not isinstance(statement, ast.Assign):
+            continue
+        targets = [part for target in statement.targets for part in getattr(target, "elts", [target])]
+        names = [part.id for part in targets if isinstance(part, ast.Name) and part.id.isupper()]
+        values = [x.value for x in ast.walk(statement.value) if isinstance(x, ast.Constant)]
+        made_by_code = any(isinstance(x, ast.Lambda) for x in ast.walk(statement.value))
+        if not names or made_by_code or not any(type(value) in (int, float) for value in values):
+            continue
+        words = [line.partition("# ")[2] for line in lines[statement.lineno - 1 : statement.end_lineno]]
+        above = itertools.takewhile(lambda line: line.startswith("#"), reversed(lines[: statement.lineno - 1]))
+        words += [line.removeprefix("#") for line in above]
+        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+            words.append(str(after.value.value))
+        yield names, " ".join(words)
 
 
 def setup(app: object) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from warpflag import __version__, sweep_command, tradeoff_command, view_command
+from warpflag.base.exit_status import BAD_INPUT, DONE, FAILED, INTERRUPTED, STOPPED, TERMINATED
 from warpflag.base.output import machine_error
 from warpflag.base.streams import explained_cache, protected_streams, tell
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-DONE, FAILED, BAD_INPUT, STOPPED, INTERRUPTED, TERMINATED = 0, 1, 2, 3, 130, 143
 _STATUS = {"done": DONE, "failed": FAILED, "stopped": STOPPED, "interrupted": INTERRUPTED, "terminated": TERMINATED}
 
 

@@ -6,6 +6,7 @@ import argparse
 import math
 from typing import Any
 
+from warpflag.base.exit_status import DONE, STOPPED
 from warpflag.base.streams import tell
 
 __all__ = ["add", "tradeoff"]
@@ -48,8 +49,8 @@ def tradeoff(options: argparse.Namespace) -> int:
         with Stop() as stop:
             print(study.execute(options.budget, options.quiet, stop.check))
     except NumericalError as error:  # before the first frame of its course
-        return tell(f"{options.scene}: {error}", 3)
-    return 0
+        return tell(f"{options.scene}: {error}", STOPPED)
+    return DONE
 
 
 def _seconds(text: str) -> float:

@@ -6,6 +6,7 @@ import argparse
 import os
 from typing import TYPE_CHECKING, Any
 
+from warpflag.base.exit_status import BAD_INPUT, DONE
 from warpflag.base.output import missing
 from warpflag.base.streams import tell
 
@@ -13,8 +14,6 @@ if TYPE_CHECKING:
     from warpflag.view.usd import Shot
 
 __all__ = ["add", "export", "plot", "render"]
-
-_DONE, _BAD_INPUT = 0, 2
 
 
 def add(commands: Any) -> None:
@@ -102,16 +101,16 @@ def plot(options: argparse.Namespace) -> int:
     if sweep_figures.is_sweep(options.directories[0]):
         figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
         print(options.output)
-        return _DONE
+        return DONE
     if options.x or options.kind in ("curves", "map"):
-        return tell(f"{options.directories[0]}: is no sweep, which --x, curves and map are for", _BAD_INPUT)
+        return tell(f"{options.directories[0]}: is no sweep, which --x, curves and map are for", BAD_INPUT)
     runs = [figures.read(directory) for directory in options.directories]
     compared = options.kind == "comparison" or (options.kind is None and (len(runs) > 1 or options.y))
     if len(runs) > 1 and not compared:
-        return tell("plot --as dashboard takes one DIR", _BAD_INPUT)
+        return tell("plot --as dashboard takes one DIR", BAD_INPUT)
     figures.save(figures.comparison(runs, options.y) if compared else figures.dashboard(runs[0]), options.output)
     print(options.output)
-    return _DONE
+    return DONE
 
 
 def render(options: argparse.Namespace) -> int:
@@ -137,8 +136,8 @@ def render(options: argparse.Namespace) -> int:
     if not options.quiet:
         print(options.output)
         if not can_write():
-            tell(f"drawn without time and scale bar: they need Pillow: {missing('Pillow', 'render')}", _DONE)
-    return _DONE
+            tell(f"drawn without time and scale bar: they need Pillow: {missing('Pillow', 'render')}", DONE)
+    return DONE
 
 
 def export(options: argparse.Namespace) -> int:
@@ -153,9 +152,9 @@ def export(options: argparse.Namespace) -> int:
     name = {"usd": "movie.usdc", "html": "cell.html"}.get(options.to, f"run.{options.to}")
     path = Path(options.output or Path(options.directories[0]) / name)
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
-        return tell("export takes several DIR for one movie: --to usd, with -o", _BAD_INPUT)
+        return tell("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
     if options.mesh and options.to != "usd":
-        return tell("--mesh is for movies: --to usd", _BAD_INPUT)
+        return tell("--mesh is for movies: --to usd", BAD_INPUT)
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":
@@ -168,7 +167,7 @@ def export(options: argparse.Namespace) -> int:
                 records[0], path
             )
     print(path)
-    return _DONE
+    return DONE
 
 
 def _shot(options: argparse.Namespace, **more: float | bool | None) -> Shot:

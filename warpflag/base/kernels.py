@@ -18,8 +18,8 @@ from warpflag.base.streams import is_terminal, tell
 __all__ = ["kernel_folder", "load_kernels", "noted_launches"]
 
 _MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
-_SECONDS_BEFORE_EXPLAINING = 2.0
-_SECONDS_PER_LOOK = 0.2
+_SECONDS_BEFORE_EXPLAINING = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
+_SECONDS_PER_LOOK = 0.2  # between two counts of what has been compiled: five a second
 
 
 def kernel_folder() -> Path:

@@ -13,10 +13,10 @@ from warpflag.base.streams import is_terminal, say
 
 __all__ = ["Progress", "bar", "watching"]
 
-_WIDEST = 100  # columns of a bar
-_WIDE = 79  # columns of a bar from which on it tells the speed, too
-_LOG_INTERVAL = 60.0
-_LOG_SHARE = 0.01
+_WIDEST = 100  # columns of a bar: a wider one reads no better
+_WIDE = 79  # columns from which on a bar tells the speed, too: below a terminal's usual 80 it does not fit
+_LOG_INTERVAL = 60.0  # s between two lines of a log: a night's run fills some hundred lines
+_LOG_SHARE = 0.01  # progress between two lines: a run of months writes no more than a hundred
 
 
 class Progress:

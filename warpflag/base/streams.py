@@ -9,6 +9,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
+from warpflag.base.exit_status import FAILED
+
 __all__ = ["explained_cache", "is_terminal", "protected_streams", "say", "tell"]
 
 
@@ -124,7 +126,7 @@ def explained_cache(command: Callable[..., int]) -> Callable[..., int]:
             if not _is_of_cache(error):
                 raise
             folder, words = sys.modules["warp"].config.kernel_cache_dir, " ".join(str(error).split())
-            return tell(f"kernel cache {folder}: can't be read ({words}); without it kernels compile anew", 1)
+            return tell(f"kernel cache {folder}: can't be read ({words}); without it kernels compile anew", FAILED)
 
     return explained
 

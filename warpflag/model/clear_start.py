@@ -25,10 +25,10 @@ __all__ = ["body_gaps", "clear_start"]
 Array = NDArray[np.floating]
 
 _PHASES = np.array([5.0 * sign * i for i in range(1, 37) for sign in (1, -1)][:-1])  # deg from the usual one, in turn
-_ROUNDS = 3  # over the flagella at fault: one that yields may come upon another
+_ROUNDS = 3  # over the flagella at fault: one that changes its phase may touch another then
 _WANTED = 0.9  # distance that a flagellum at fault is given, in diameters of the contact
 _TURNS = 300  # steps of turning
-_LARGEST_STEP = 0.03  # rad
+_LARGEST_STEP = 0.03  # rad: moves the tip of a flagellum of 7 um by the radius of its helix
 _LARGEST_TURN = 45.0  # deg; beyond, the scene is refused
 _SOFT = 1e-4  # um^2; arms that turn a contact by less than a hundredth of it hardly count
 _MOST = 500  # flagella; in larger crowds those that are on each other are left to the contact force

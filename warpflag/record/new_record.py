@@ -31,7 +31,7 @@ FORMAT = ("v108", "v108")
 """The format of HDF5 1.8, in which groups and headers of datasets have checksums. Later formats mark a file as open
 while it is written, and one whose writer was killed can't be opened again."""
 
-_CHUNK_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 20  # of a chunk, for 16 to 64 frames: HDF5's cache of chunks holds one
 _WHOLE = {"step": np.int64, FORM: np.int8}  # types of whole numbers by entry
 _NUMBERS = itertools.count()
 _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows

@@ -32,8 +32,8 @@ from warpflag.record.layout import (
 
 __all__ = ["Contents", "open_file", "read_contents"]
 
-_ATTEMPTS = 10
-_SECONDS_BETWEEN = 0.01
+# Looks at a record that is being written, and the time between two: a block of frames is written in a few ms.
+_ATTEMPTS, _SECONDS_BETWEEN = 10, 0.01
 
 
 @dataclass(frozen=True)

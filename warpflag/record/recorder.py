@@ -37,7 +37,7 @@ from warpflag.record.rows import Rows
 
 __all__ = ["Recorder"]
 
-_BLOCK_SECONDS = 2.0
+_BLOCK_SECONDS = 2.0  # after which pending frames are committed: what a killed run loses at most
 
 
 class Recorder:

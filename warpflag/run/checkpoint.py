@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 __all__ = ["CheckpointError", "exists", "load", "save"]
 
-_KEPT = 2
+_KEPT = 2  # the newest, and one to fall back to where that is damaged
 _NAME = re.compile(r"checkpoint-(\d+)\.npz")
 
 

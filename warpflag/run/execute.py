@@ -25,11 +25,11 @@ from warpflag.run.summary import accuracy_kept
 
 __all__ = ["SUSPECT", "Run"]
 
-_CHECKPOINT_SECONDS = 5.0
+_CHECKPOINT_SECONDS = 5.0  # wall time between two checkpoints: what a killed run computes again
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
-_SECONDS_PER_COPY = 0.05
-_WRITERS = 8
-# Estimate of the worst window over the accuracy from which the motion is looked at, at the cost of more steps; windows
+_SECONDS_PER_COPY = 0.05  # wall time between two copies of all cells, a hundredth of that between checkpoints
+_WRITERS = 8  # threads that write files: a disk takes many at once faster, and waits are most of it
+# Estimate of the worst window over the accuracy from which on a run is followed by disturbed copies (`growth`); windows
 # of sound zipping runs reach four.
 SUSPECT = 5.0
 
@@ -186,7 +186,7 @@ class Run:
             self._finish(cell, "stopped" if fault else "done", facts, fault)
 
     def _finish(self, cell: int, status: str, facts: Mapping[str, Any], fault: NumericalError | None) -> None:
-        """Ends a member, whose motion is looked at where its estimates are high or a guard has stopped it."""
+        """Ends a member; where its estimates are high, or a guard has stopped it, disturbed copies are followed."""
         member, kept = self.members[cell], facts["accuracy"]
         high = kept["worst_window"] is not None and kept["worst_window"] > SUSPECT * kept["asked"]
 

@@ -49,7 +49,7 @@ _ADVICE = {
 }
 _OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE)
 """Faults of a cell as a whole: no segment is to blame."""
-_NOTABLE = 3.0  # a value this many times from the default is named
+_NOTABLE = 3.0  # a value this many times from the default is named: factors of two are ordinary choices
 _EXTERNAL = 1.0  # weight of a force from outside among the causes, that of a value e times its default
 _CROWDED = 3.0  # anchors nearer than so many diameters are named
 
@@ -129,7 +129,7 @@ def _nearest_anchors(scene: Scene) -> float | None:
 
 
 _MOST_COMPARED = 500
-"""Flagella whose anchors are compared."""
+"""Flagella whose anchors are compared: all pairs of them take some hundredths of a second."""
 
 
 def found_faults(

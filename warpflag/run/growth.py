@@ -34,7 +34,7 @@ UNSTABLE = 100.0
 PATIENCE = 20.0
 """Computing time that may go into following a run [s]."""
 _DISTURBANCE = {"float64": 1.0e-6, "float32": 1.0e-4}  # um, above round-off and far below contact distances
-_LOOKS = 10
+_LOOKS = 10  # at the pair while it is followed: growth is told at the first that shows it
 
 
 @dataclass(frozen=True)

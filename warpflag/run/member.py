@@ -32,9 +32,8 @@ __all__ = ["Member", "Outcome"]
 
 # HDF5 leaves a file that can't be opened when a write of its own fails, so the disk is looked at before: room for a
 # chunk of frames, twice, and for checkpoint and summary.
-_LEAST_ROOM = 1 << 18
-_FRAMES_OF_ROOM = 160
-_FRAMES_PER_COMMIT = 64
+_LEAST_ROOM, _FRAMES_OF_ROOM = 1 << 18, 160  # bytes, and frames: more than two chunks of 64
+_FRAMES_PER_COMMIT = 64  # of a member of a batch: a whole chunk of its record
 
 
 @dataclass(frozen=True)

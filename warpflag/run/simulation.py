@@ -34,7 +34,7 @@ from warpflag.stepping import System, make_stepper
 
 __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
-_SECONDS_PER_REPLAY = 0.2
+_SECONDS_PER_REPLAY = 0.2  # between two looks from the host: signals are answered that fast, and a look costs 1e-5 s
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
 
 

@@ -28,7 +28,7 @@ __all__ = [
 
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _PRINTED = (1.6e-3, 2.8e-3, 1.26e-6)  # gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s] of the paper
-_ZETA_3 = 1.2020569031595942
+_ZETA_3 = 1.2020569031595942  # sum of 1/n^3 over n = 1, 2, ...
 _SOUND = 1 - 1e-9  # round-off of the condition that a pair radius was chosen by
 _BOLTZMANN = 1.380649e-5  # pN um/K, exact
 

@@ -19,9 +19,9 @@ __all__ = ["flattened", "nearest", "parsed", "read_overrides", "read_toml", "sec
 # Beyond any sensible scene, and below what the parser of TOML takes much time or memory for. Ten thousand flagella
 # with every key of their own, as `dumps` writes them, are 3 MB.
 _MOST_BYTES = 4 * 2**20
-_LONGEST_QUOTE = 80  # characters of a line that an error shows
-_DEEPEST = 16  # levels of arrays, inline tables and dotted keys
-_MOST_DIGITS = 1000
+_LONGEST_QUOTE = 80  # characters of a line that an error shows: a line of a terminal
+_DEEPEST = 16  # levels of arrays, inline tables and dotted keys: a scene has four
+_MOST_DIGITS = 1000  # of a number: far beyond any float, and few enough for the parser's quadratic time
 
 # Strings, also those without an end, and comments: what looks like brackets or dots there is none.
 _STRING = re.compile(

@@ -22,6 +22,7 @@ __all__ = ["EULER_STEPS_PER_CHECK", "RkcStepper", "euler_step"]
 LONGEST_STEP = 1.0e-4
 """Longest step of RKC under accuracy control [s]."""
 EULER_STEPS_PER_CHECK = 100
+"""Steps of Euler between two checks by the guards."""
 
 
 def euler_step(scene: Scene) -> float:

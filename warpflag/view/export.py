@@ -16,7 +16,7 @@ from warpflag.view.coloring import Coloring
 
 __all__ = ["write_csv", "write_vtkhdf", "write_xyz"]
 
-_BLOCK_POINTS = 1 << 16
+_BLOCK_POINTS = 1 << 16  # nodes that are taken from the record at once: some MB
 _KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 
 

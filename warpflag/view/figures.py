@@ -54,8 +54,10 @@ _LINE_STYLES = ("-", "--", ":", "-.")
 _BUNDLING = ("phase_difference", "bundle_length", "steric_force_density")
 _SWIMMING = ("body_speed", "body_rate")
 _FEW = 4  # lines of a panel that can be told apart; of more, mean and range are drawn
-_SHARE_IN_VIEW = 0.99  # of the values of a panel, at least
-_PEAK = 1.6  # a panel shows all values when they reach no further than this times what that share needs
+_SHARE_IN_VIEW = 0.99  # of the values of a panel are shown at least: peaks of single frames may be left out
+# A panel shows all values where they reach no further than this times what that share needs, which then fills at least
+# 1/1.6, five eighths, of its height.
+_PEAK = 1.6
 
 
 @dataclass(frozen=True)

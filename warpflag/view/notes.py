@@ -17,8 +17,8 @@ from warpflag.view.coloring import FORM_COLORS, map_color
 
 __all__ = ["Pen", "can_write"]
 
-INK = (38, 50, 63)
-FAINT = (112, 124, 138)
+INK = (38, 50, 63)  # sRGB of letters and bars: a dark slate
+FAINT = (112, 124, 138)  # sRGB of what stands back, half as dark
 _LENGTHS = [base * 10.0**power for power in range(-3, 4) for base in (1, 2, 5)]  # um, of scale bars
 _DIGIT_HEIGHT = 0.73  # of the font, in units of its size
 

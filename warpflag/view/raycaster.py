@@ -15,8 +15,8 @@ __all__ = ["draw"]
 Array = NDArray[np.float64]
 
 _SCREEN_TOP, _SCREEN_BOTTOM = "#fafbfc", "#dde5ee"
-_SCREEN_GAP = 0.6  # um, from the farthest thing to the screen
-_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+_SCREEN_GAP = 0.6  # um, from the farthest thing to the screen: shadows lie near what casts them
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; turned by it, points of a spiral lie most evenly
 
 
 def draw(

@@ -19,10 +19,15 @@ from warpflag_kernels.fluid import body_flow
 
 
 @functools.cache
-def mobility(p: Precision) -> SimpleNamespace:
-    """Device function `respond`: velocity and angular velocity of a body under a force and a torque."""
+def mobility(p: Precision, shell: bool | None = None) -> SimpleNamespace:
+    """Device function `respond`: velocity and angular velocity of a body under a force and a torque.
+
+    Args:
+        p: precision.
+        shell: whether bodies are shells of beads; None: as the model says at run time.
+    """
     real, vec3, Model, State = p.real, p.vec3, structs(p).Model, structs(p).State
-    module = p.module("body_mobility")
+    module = p.module("body_mobility", {None: "", False: "spheroid", True: "shell"}[shell])
 
     @wp.func(module=module)
     def respond_as_shell(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
@@ -40,11 +45,7 @@ def mobility(p: Precision) -> SimpleNamespace:
         return axes * u, axes * w
 
     @wp.func(module=module)
-    def respond(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
-        """Velocity [um/s] and angular velocity [rad/s] of the body of cell c; torque about its centre."""
-        if model.body.shell_mobility.shape[0] > 0:
-            u, w = respond_as_shell(model, state, c, force, torque)
-            return u, w
+    def respond_as_spheroid(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
         axis = state.pose.body_axis[c]
         force_along = wp.dot(axis, force) * axis
         torque_along = wp.dot(axis, torque) * axis
@@ -52,16 +53,29 @@ def mobility(p: Precision) -> SimpleNamespace:
         spin = model.body.spin_mobility[c] * torque_along + model.body.tumble_mobility[c] * (torque - torque_along)
         return velocity, spin
 
+    @wp.func(module=module)
+    def respond_as_either(model: Model, state: State, c: wp.int32, force: vec3, torque: vec3):
+        if model.body.shell_mobility.shape[0] > 0:
+            u, w = respond_as_shell(model, state, c, force, torque)
+            return u, w
+        velocity, spin = respond_as_spheroid(model, state, c, force, torque)
+        return velocity, spin
+
+    respond = {None: respond_as_either, False: respond_as_spheroid, True: respond_as_shell}[shell]
     return SimpleNamespace(respond=respond)
 
 
+def _variant(terms: tuple[Term, ...], shell: bool) -> str:
+    return variant(terms) + "_shell" * shell
+
+
 @functools.cache
-def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
+def functions(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamespace:
     """Device functions: force and torque of one flagellum on the body, and the velocities of one body."""
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    on_body, respond = combined(p, terms).on_body, mobility(p).respond
-    module = p.module("body_functions", variant(terms))
+    on_body, respond = combined(p, terms).on_body, mobility(p, shell).respond
+    module = p.module("body_functions", _variant(terms, shell))
 
     @wp.func(module=module)
     def sum_flagellum(model: Model, state: State, k: wp.int32):
@@ -76,7 +90,7 @@ def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     def move(model: Model, state: State, c: wp.int32):
         force = vec3(real(0.0))
         torque = vec3(real(0.0))
-        if state.surface_force.shape[0] > 0:
+        if wp.static(shell):
             force = state.surface_force[c]
             torque = state.surface_torque[c]
         k = model.first_flagellum[c]
@@ -92,11 +106,11 @@ def functions(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
+def _kernels(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
-    f = functions(p, terms)
+    f = functions(p, terms, shell)
     sum_flagellum, move = f.sum_flagellum, f.move
-    module = p.module("body", variant(terms))
+    module = p.module("body", _variant(terms, shell))
     settle = combined(p, terms).settle
     kernels = SimpleNamespace()
     if settle is not None:
@@ -142,7 +156,7 @@ def _kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
 
 def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
     """Force [pN] and torque about the body's centre [pN um] of every flagellum on its body, of these terms."""
-    kernel = _kernels(model.precision, terms).sum_flagella
+    kernel = _kernels(model.precision, terms, model.switches.flows.body).sum_flagella
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -168,7 +182,7 @@ def move_bodies(model: DeviceModel, state: DeviceState) -> None:
 
 
 def _move(model: DeviceModel, state: DeviceState) -> None:
-    kernel = _kernels(model.precision, model.terms).move
+    kernel = _kernels(model.precision, model.terms, model.switches.flows.body).move
     wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -187,6 +201,6 @@ def body_motion(
     if model.switches.flows.body:
         obstruct(model, state, single)
     if any(hasattr(term.functions(model.precision), "settle") for term in terms):
-        kernel = _kernels(model.precision, terms).settle
+        kernel = _kernels(model.precision, terms, model.switches.flows.body).settle
         wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
     _move(model, state)

@@ -20,11 +20,12 @@ from warpflag_kernels.rod import chain_chart, hessian
 
 
 @functools.cache
-def functions(p: Precision) -> SimpleNamespace:
-    """Device functions: the body's mobility on six numbers, and the inverse of a matrix."""
+def functions(p: Precision, shell: bool) -> SimpleNamespace:
+    """Device functions: the mobility of a body, a shell of beads or a spheroid, on six numbers, and the inverse of a
+    matrix."""
     real, vec3, vec6, mat66 = p.real, p.vec3, block_band.types(p).vec6, block_band.types(p).mat66
-    Model, State, respond = structs(p).Model, structs(p).State, body.mobility(p).respond
-    module = p.module("body_coupling_functions")
+    Model, State, respond = structs(p).Model, structs(p).State, body.mobility(p, shell).respond
+    module = p.module("body_coupling_functions", "shell" * shell)
 
     @wp.func(module=module)
     def body_rate(model: Model, state: State, c: wp.int32, load: vec6):
@@ -77,14 +78,15 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
+def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace:
     real, vec3, t = p.real, p.vec3, block_band.types(p)
     mat46, mat66, vec6, Band = t.mat46, t.mat66, t.vec6, t.Band
     Model, State, Stiffness = structs(p).Model, structs(p).State, hessian.struct(p)
-    Increment, body_rate, inverse6 = chain_chart.types(p).Increment, functions(p).body_rate, functions(p).inverse6
+    Increment, body_rate = chain_chart.types(p).Increment, functions(p, shell).body_rate
+    inverse6 = functions(p, shell).inverse6
     solve_column, solve_columns = cholesky.functions(p).solve_column, block_band_simd.functions(p).columns
     follow = block_band.functions(p).follow
-    module = p.module("body_coupling", "bearing" if bearing_torque else "")
+    module = p.module("body_coupling", "_".join([*["bearing"] * bearing_torque, *["shell"] * shell]))
 
     @wp.kernel(module=module)
     def couple_body(
@@ -290,7 +292,7 @@ def _kernels(p: Precision, bearing_torque: bool) -> SimpleNamespace:
 
 
 def _kernels_of(model: DeviceModel) -> SimpleNamespace:
-    return _kernels(model.precision, model.switches.has("bearing"))
+    return _kernels(model.precision, model.switches.has("bearing"), model.switches.flows.body)
 
 
 def couple(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any) -> None:

@@ -145,7 +145,7 @@ def functions(p: Precision, flows: Flows, step_pairs: str, chains: str, threads:
     Flow, vec6 = flow_stage.struct(p), chain_chart.types(p).vec6
     sums = flow_stage.functions(p, flows, step_pairs)
     load, spread, flow_at, loaded_end = sums.load, sums.spread, sums.flow_at, sums.loaded_end
-    band_functions, body_rate = block_band.functions(p), body_coupling.functions(p).body_rate
+    band_functions, body_rate = block_band.functions(p), body_coupling.functions(p, flows.body).body_rate
     drag, solve_flagellum = band_functions.drag, band_functions.solve_flagellum
     solve_cell, follow = band_functions.solve_cell, band_functions.follow
     jacobian = contact_list.functions(p)

@@ -68,17 +68,17 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
+def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Implicit, MotorSolve = structs(p).Model, structs(p).State, collocation.struct(p), struct(p)
     Band, vec6 = block_band.types(p).Band, block_band.types(p).vec6
-    Increment, law, respond = chain_chart.types(p).Increment, laws.curves(p), body.mobility(p).respond
+    Increment, law, respond = chain_chart.types(p).Increment, laws.curves(p), body.mobility(p, shell).respond
     drive_at, settled = law.drive_at, law.settled
-    body_rate, inverse6 = body_coupling.functions(p).body_rate, body_coupling.functions(p).inverse6
+    body_rate, inverse6 = body_coupling.functions(p, shell).body_rate, body_coupling.functions(p, shell).inverse6
     follow = block_band.functions(p).follow
     most = wp.constant(laws.MOST_ITERATIONS)
     one, zero = wp.constant(real(1.0)), wp.constant(real(0.0))
-    module = p.module("motor_solve", "averaged" if averaged else "")
+    module = p.module("motor_solve", "_".join([*["averaged"] * averaged, *["shell"] * shell]))
 
     @wp.func(module=module)
     def share_of(band: Band, motors: MotorSolve, c: wp.int32):
@@ -270,7 +270,7 @@ def _kernels(p: Precision, averaged: bool) -> SimpleNamespace:
 
 def prepare(model: DeviceModel, state: DeviceState, band: Any, motors: Any) -> None:
     """What unit torques do to a step, from the factors of its matrix."""
-    kernels, device = _kernels(model.precision, model.switches.noise), model.device
+    kernels, device = _kernels(model.precision, model.switches.noise, model.switches.flows.body), model.device
     inputs = [model.data, state.data, motors]
     wp.launch(kernels.load_tripods, model.element_count, inputs=inputs, device=device)
     block_band.solve(model, state, band, motors.answer)
@@ -288,7 +288,7 @@ def solve(
         last, found: the last increment, and what has been found of this one, both at the present pose.
         x: what an iteration has found with the torques as they were; changed.
     """
-    kernels, device = _kernels(model.precision, model.switches.noise), model.device
+    kernels, device = _kernels(model.precision, model.switches.noise, model.switches.flows.body), model.device
     inputs = [model.data, data, band, gain, last, found, x, state.data, motors]
     wp.launch(kernels.find_torques, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band, gain, motors, x]
@@ -297,5 +297,8 @@ def solve(
 
 def average_rates(model: DeviceModel, state: DeviceState, band: Any, motors: Any, x: Any) -> None:
     """The average rates after a step, whose whole increment is x; only with thermal noise."""
-    kernel, inputs = _kernels(model.precision, True).average, [model.data, state.data, band, x, motors]
+    kernel, inputs = (
+        _kernels(model.precision, True, model.switches.flows.body).average,
+        [model.data, state.data, band, x, motors],
+    )
     wp.launch(kernel, model.flagellum_count, inputs=inputs, device=model.device)

@@ -70,7 +70,7 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: F
     Model, State = structs(p).Model, structs(p).State
     PairSum, Neighbours, Shell = rotne_prager.struct(pair), neighbours.struct(p), shell_stage.struct(pair)
     evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
-    gather, motion = forces.functions(p, terms).gather, body.functions(p, terms)
+    gather, motion = forces.functions(p, terms).gather, body.functions(p, terms, flows.body)
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
     move_cell = node_velocity.functions(p, pair, flows, pair_sum).move_cell

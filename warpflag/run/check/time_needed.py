@@ -12,13 +12,13 @@ from warpflag.run.simulation import Simulation
 
 __all__ = ["Needed", "needed"]
 
-_SAMPLE_SECONDS = 0.3  # of computing
-_MOST_SECONDS = 8.0  # of computing for all samples
-_SETTLED = 4e-4  # s, when the steps of the start, which are short, are behind
-_FRAMES_OBSERVED = 8
-_COLD = 6.0  # s of preparing, above which kernels have been compiled
-_PER_FRAME = 1.5e-4  # s for the record of a frame
-_MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame
+_SAMPLE_SECONDS = 0.3  # of computing: long enough to be timed to some per cent
+_MOST_SECONDS = 8.0  # of computing for all samples, so that the whole check takes some ten seconds
+_SETTLED = 4e-4  # simulated time [s] from which on steps have their usual length; those of the start are shorter
+_FRAMES_OBSERVED = 8  # frames whose observables are timed at once, as a run measures blocks of them
+_COLD = 6.0  # s of preparing, above which kernels have been compiled: with a warm cache it takes one
+_PER_FRAME = 1.5e-4  # s for the record of a frame; measured on zipping.toml
+_MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame; measured on zipping.toml
 # Contacts ask for more and dearer steps: stepping of whole runs over what the first steps say (docs/tradeoff.md).
 _LEAST, _FEW, _TOUCHING, _PER_FLAGELLUM, _CROWD = 0.8, 1.4, 1.8, 0.45, 8
 

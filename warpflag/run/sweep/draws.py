@@ -20,7 +20,7 @@ from warpflag.scene.reading import check_key
 
 __all__ = ["Draws"]
 
-_TRIES = 2000
+_TRIES = 2000  # places drawn for an anchor before the sweep is refused: one in 500 that are free is missed at 2 %
 _PER_FLAGELLUM = "flagellum."
 _ANCHOR_KEYS = ("placement", "least_distance", "from", "to", "clearance", "given")
 _GOLDEN_ANGLE = 180.0 * (3.0 - math.sqrt(5.0))  # deg; successive points of an even spiral

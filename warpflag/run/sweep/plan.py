@@ -40,7 +40,7 @@ __all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_
 
 BASE_NAME = "base.toml"
 _KEYS = ("base", "name", "repeats", "set", "axes", "random")
-_MOST_MEMBERS = 1_000_000
+_MOST_MEMBERS = 1_000_000  # of a sweep: more is a slip in its axes, and their scenes would take gigabytes
 
 
 class BadMembers(ValueError):

@@ -23,7 +23,7 @@ from warpflag.scene import Scene, dumps
 
 __all__ = ["Batch", "Pool", "best_size"]
 
-_SECONDS_PER_LOOK = 0.1
+_SECONDS_PER_LOOK = 0.1  # at the workers: a moment for a person, nothing beside a member
 _COMMAND = [sys.executable, "-m", "warpflag.run.sweep.worker"]
 # A worker is one process of one thread; the libraries below NumPy would start one per core in each.
 _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from warpflag.base.exit_status import TERMINATED
 from warpflag.base.output import missing
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
@@ -20,9 +21,9 @@ from warpflag.run.sweep.sweep import FINISHED, SweepRun
 
 __all__ = ["Jobs", "Share"]
 
-_USED = 0.8  # of a job's wall time that the members' measured times may fill
-_MOST_REQUEUES = 1000
-_TERMINATED = 143
+# Share of a job's wall time that the members' measured times may fill: the rest is for those that take longer.
+_USED = 0.8
+_MOST_REQUEUES = 1000  # times a job may be requeued: no limit in practice
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Jobs:
                 "trap 'kill -USR1 $sweep' USR1 TERM",
                 "wait $sweep; status=$?",
                 "while kill -0 $sweep 2> /dev/null; do wait $sweep; status=$?; done",
-                f'[ $status = {_TERMINATED} ] && scontrol requeue "$SLURM_JOB_ID"',
+                f'[ $status = {TERMINATED} ] && scontrol requeue "$SLURM_JOB_ID"',
                 "exit $status",
                 "",
             ]

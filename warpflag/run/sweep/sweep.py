@@ -28,10 +28,10 @@ __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 
 FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
-_LARGEST_BATCH = {"cpu": 64, "cuda": 512}
-_SAMPLE_CELLS = 8
-_SECONDS_PER_TABLE = 10.0
-_SECONDS_FOR_LOCKS = 10.0
+_LARGEST_BATCH = {"cpu": 64, "cuda": 512}  # members: what a worker that dies begins again; a GPU needs many to be full
+_SAMPLE_CELLS = 8  # members on which batch and single runs are timed
+_SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run
+_SECONDS_FOR_LOCKS = 10.0  # for which members of a sweep that was killed may still be held by its workers
 
 
 @dataclass

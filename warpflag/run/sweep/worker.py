@@ -29,9 +29,9 @@ from warpflag.scene import Scene, loads
 
 __all__ = ["main"]
 
-_SECONDS_PER_REPORT = 0.2
-_SAMPLE_SECONDS = 0.3
-_FIRST_PART = 64  # of the simulated time is what is timed first
+_SECONDS_PER_REPORT = 0.2  # between two reports of the time reached: five a second
+_SAMPLE_SECONDS = 0.3  # of computing, which a sample takes at least: long enough to be timed to some per cent
+_FIRST_PART = 64  # the first sample is the simulated time over this; each further one is twice as long
 
 
 def main() -> None:

@@ -13,11 +13,11 @@ __all__ = ["SOURCES", "Choice", "choices_of", "reference", "relative_cost"]
 SOURCES = ("time step", "precision", "mesh", "model", "execution")
 """What an error comes from, in the order of the report."""
 _ACCURACIES = (5e-2, 2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 1e-4)  # um per ms, of the implicit stepper
-_RKC_ACCURACIES = (5e-2, 5e-3)
-_STEPS = (2e-5, 1e-5)  # fixed steps [s]
-_RELATIVE_COST = {"rkc": 10.0}  # of a stepper, roughly
+_RKC_ACCURACIES = (5e-2, 5e-3)  # as draft and standard; finer ones take minutes
+_STEPS = (2e-5, 1e-5)  # fixed steps [s]: near those that step control takes
+_RELATIVE_COST = {"rkc": 10.0}  # of a stepper, roughly: zipping.toml takes nine times as long
 _COST_POWER = 0.4  # cost goes as accuracy to the minus this: errors of steps as dt^2.5
-_MESHES = (2.0, 1.5, 0.75, 0.5)  # segment lengths over the scene's
+_MESHES = (2.0, 1.5, 0.75, 0.5)  # segment lengths over the scene's: to either side by a factor of two
 _MODES = ("none", "within", "all", "consistent")
 
 

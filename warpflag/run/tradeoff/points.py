@@ -24,7 +24,7 @@ __all__ = ["MEASURES", "Point", "load", "measured", "save"]
 MEASURES = ("theta", "l_r", "f_c", "motor_rate", "body_rate", "speed")
 """What is compared beside node positions: means over the second half of a window."""
 _OF_FRAMES = ("phase_difference", "bundle_length", "steric_force_density", "motor_rate", "body_rate", "body_speed")
-_FRAMES = 40
+_FRAMES = 40  # of a window: means over its second half have twenty
 _SHORT = 0.5  # s of computing: below, the cost is the least of two runs
 
 

@@ -27,8 +27,8 @@ from warpflag.view.usd.cell import SPOKE_COLORS, SPOKE_LENGTHS, SPOKE_WIDTH
 
 __all__ = ["content"]
 
-_UNDEFINED = 255
-_STEPS = 65535
+_UNDEFINED = 255  # colour number of a value that is not defined; the others are 0 to 254
+_STEPS = 65535  # of a coordinate in 16 bits
 _BYTES_PER_NODE = 9  # three coordinates and three quantities
 
 

@@ -13,8 +13,8 @@ from warpflag.view.page.content import content
 
 __all__ = ["notebook_frame", "page_of", "write_page"]
 
-_NOTEBOOK_BYTES = 2 << 20
-_NOTEBOOK_HEIGHT = 740  # pixels
+_NOTEBOOK_BYTES = 2 << 20  # of a page inside a notebook, which is stored with it
+_NOTEBOOK_HEIGHT = 740  # pixels: the page without a scroll bar
 
 
 def write_page(record: Record, path: str | Path, color_by: str = "flagellum", follow: bool = True) -> None:

@@ -18,10 +18,10 @@ __all__ = ["Extent", "add_camera", "add_lights", "arranged", "steady_path", "vie
 Array = NDArray[np.float64]
 
 _FOCAL_LENGTH = 60.0  # in tenths of a scene unit as the apertures; only their ratio counts
-_WIDEST = 16 / 9
+_WIDEST = 16 / 9  # width over height of a picture: that of screens and films
 _TANGENTS = np.array([0.3, 0.3 / _WIDEST])  # of half the angles of view across and up
-_FRAMING_MARGIN = 1.06
-# What reaches where: see Extent.
+_FRAMING_MARGIN = 1.06  # distance of the camera over that at which all just fits in: 3 % free on each side
+# Weights of (x, y, z) in the reach to right, left, up, down, front and back, see `Extent`.
 _SIDES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
 _SIDES[:4, 2] = np.repeat(_TANGENTS, 2)
 _ELEVATION = np.radians(12.0)  # the camera looks down a little, so that coils read as coils

@@ -38,8 +38,8 @@ from warpflag.view.usd.mesh_cell import MeshCell
 __all__ = ["Shot", "movie_stage", "write_movie"]
 
 SUFFIXES = (".usdc", ".usda", ".usdz")
-_CLIP_BYTES = 1 << 28
-_BLOCK_BYTES = 1 << 21
+_CLIP_BYTES = 1 << 28  # of a file of samples: larger movies are cut into clips, which programs load one by one
+_BLOCK_BYTES = 1 << 21  # of samples that are made at once: fit a core's cache
 _BYTES_PER_NODE = 28  # point, colour and raw value
 _BYTES_PER_MESH_NODE = 16 * (28 + 12)  # two rings of eight vertices, each with its normal
 
