@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpflag.model.shell import rotne_prager
 from warpflag.observables import segment_tangents
 from warpflag.record import Record
 from warpflag.scene import loads
@@ -29,18 +30,11 @@ def mobility(positions: np.ndarray, first_node: np.ndarray, h: float, radius: fl
         nodes.append(positions[first + 1 : end])
         shares.append(np.append(np.ones(len(t) - 1), 0.5))  # half a segment at the free end
     x, t, share = np.concatenate(nodes), np.concatenate(tangents), np.concatenate(shares)
-    gap = x[:, None] - x[None]
-    r = np.linalg.norm(gap, axis=-1) + np.eye(len(x))
-    apart = r > 2 * radius
-    even = np.where(apart, (1 + 2 * radius**2 / (3 * r**2)) / (8 * r), (1 - 9 * r / (32 * radius)) / (6 * radius))
-    radial = np.where(apart, (1 - 2 * radius**2 / r**2) / (8 * r), 3 * r / (32 * radius) / (6 * radius))
-    unit = gap / r[..., None]
-    pairs = even[..., None, None] * np.eye(3) + radial[..., None, None] * unit[..., None] * unit[..., None, :]
-    pairs /= np.pi * viscosity
+    pairs = rotne_prager(x, radius, x, radius) / (8 * np.pi * viscosity)
     i = np.arange(len(x))
     tt = t[:, :, None] * t[:, None, :]
-    pairs[i, i] = (along * tt + across * (np.eye(3) - tt)) / share[:, None, None]
-    return pairs.transpose(0, 2, 1, 3).reshape(3 * len(x), 3 * len(x))
+    pairs[i, :, i] = (along * tt + across * (np.eye(3) - tt)) / share[:, None, None]
+    return pairs.reshape(3 * len(x), 3 * len(x))
 
 
 def smallest_eigenvalues(record: Record) -> np.ndarray:

@@ -67,7 +67,7 @@ class Attack:
         seed = 100_000 * self.seed + number
         actions: dict[str, Callable[[], Found]] = {
             "kills": lambda: runs.kill(self.base, seed, scratch),
-            "signals": lambda: signals.signalled(self.base, seed, scratch),
+            "signals": lambda: signals.asked_to_end(self.base, seed, scratch),
             "limits": lambda: runs.limit(self.base, seed, scratch),
             "damage": lambda: runs.damage(self.base, seed, scratch),
             "malformed": lambda: scenes.malformed_scene(seed, scratch),

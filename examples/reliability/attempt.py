@@ -7,6 +7,8 @@ import re
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ traceback: more than the lines that a user should see, a crash, or no end.
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE = 120.0
 """Wall time after which a command is taken to hang [s]."""
+LIFE = 1.05
+"""Times the undisturbed wall time of a command within which a signal comes: now and then it has ended before."""
 
 
 _PROGRESS = re.compile(r"\s*\d+ %|.*compiling kernels")
@@ -61,6 +65,37 @@ def command(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]
     env = {**os.environ, **own, **options.pop("env", {})}
     line = [sys.executable, "-m", "warpflag", *arguments]
     return subprocess.run(line, capture_output=True, text=True, errors="replace", env=env, **options)
+
+
+@dataclass(frozen=True)
+class Signalled:
+    """How a process ended that got a signal.
+
+    Attributes:
+        status: its exit status, minus the number of the signal that it died of.
+        said: what it wrote on standard error.
+        before: whether it had ended before the signal came.
+    """
+
+    status: int
+    said: str
+    before: bool
+
+
+def signalled(arguments: Sequence[str], number: signal.Signals, after: float) -> Signalled | None:
+    """The command `warpflag` that gets a signal after so long [s]; None where it goes on for `PATIENCE` then."""
+    line = [sys.executable, "-m", "warpflag", *arguments]
+    process = subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    time.sleep(after)
+    before = process.poll() is not None
+    process.send_signal(number)
+    try:
+        _, said = process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return None
+    return Signalled(process.returncode, said, before)
 
 
 def problem(ended: subprocess.CompletedProcess[str]) -> str:

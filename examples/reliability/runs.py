@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from examples.reliability.attempt import PATIENCE, Found, command, found, frames_of, leading, problem, same, told
+from examples.reliability.attempt import LIFE, Found, command, found, frames_of, leading, problem, same, signalled, told
 from examples.reliability.damage import damaged
 
 SCENE = """
@@ -43,9 +43,10 @@ class Base:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
             self.scene.write_text(SCENE)
-            ended = command("run", str(self.scene), "-o", str(self.whole), *CHECKPOINTS)
+            ended = command(*self.arguments(self.whole))
             assert ended.returncode == 0, ended.stderr
-            begun = subprocess.Popen(self._line(folder / "half"), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+            line = [sys.executable, "-m", "warpflag", *self.arguments(folder / "half")]
+            begun = subprocess.Popen(line, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
             while not (folder / "half" / "checkpoint-000002.npz").exists() and begun.poll() is None:
                 time.sleep(0.002)
             begun.kill()
@@ -55,12 +56,13 @@ class Base:
             assert ended.returncode == 0, ended.stderr
         self.frames = frames_of(self.whole)
         begin = time.monotonic()
-        command("run", str(self.scene), "-o", str(folder / "timed"), *CHECKPOINTS)
+        command(*self.arguments(folder / "timed"))
         self.seconds = time.monotonic() - begin
         shutil.rmtree(folder / "timed", ignore_errors=True)
 
-    def _line(self, directory: Path) -> list[str]:
-        return [sys.executable, "-m", "warpflag", "run", str(self.scene), "-o", str(directory), *CHECKPOINTS]
+    def arguments(self, directory: Path) -> list[str]:
+        """Of the command that runs the scene into a directory."""
+        return ["run", str(self.scene), "-o", str(directory), *CHECKPOINTS]
 
 
 def _completed(base: Base, directory: Path, done: str) -> Found:
@@ -84,22 +86,15 @@ def kill(base: Base, seed: int, folder: Path) -> Found:
     """A run killed at a random moment from its first millisecond to its last, by KILL, INT or TERM; then resumed."""
     chance, directory = random.Random(f"kill {seed}"), folder / "killed"
     number = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)[seed % 3]
-    after = chance.random() * base.seconds * 1.05
-    process = subprocess.Popen(base._line(directory), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(after)
-    ended_before = process.poll() is not None
-    process.send_signal(number)
-    try:
-        _, said = process.communicate(timeout=PATIENCE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    after = chance.random() * base.seconds * LIFE
+    ended = signalled(base.arguments(directory), number, after)
+    if ended is None:
         return found("traceback", f"{number.name} after {after:.2f} s: goes on")
-    done = f"{number.name} after {after:.2f} of {base.seconds:.2f} s" + (", ended before" if ended_before else "")
-    if number == signal.SIGINT and not directory.exists() and "KeyboardInterrupt" in said:
+    done = f"{number.name} after {after:.2f} of {base.seconds:.2f} s" + (", ended before" if ended.before else "")
+    if number == signal.SIGINT and not directory.exists() and "KeyboardInterrupt" in ended.said:
         return found("right", f"{done}: before the program began")
-    if "Traceback" in said:
-        return found("traceback", f"{done}: {said.strip().splitlines()[-1]}")
+    if "Traceback" in ended.said:
+        return found("traceback", f"{done}: {ended.said.strip().splitlines()[-1]}")
     if (directory / "run.h5").exists():
         try:
             if not leading(frames_of(directory), base.frames):
@@ -118,7 +113,7 @@ def limit(base: Base, seed: int, folder: Path) -> Found:
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 
-    ended = command("run", str(base.scene), "-o", str(directory), *CHECKPOINTS, preexec_fn=limited)
+    ended = command(*base.arguments(directory), preexec_fn=limited)
     done = f"files of at most {size} bytes: status {ended.returncode}"
     if wrong := problem(ended):
         return found("traceback", f"{done}: {wrong}")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import random
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
-from examples.reliability.attempt import PATIENCE, Found, command, found, frames_of, problem, same, told
+from examples.reliability.attempt import LIFE, Found, command, found, frames_of, problem, same, signalled, told
 from examples.reliability.runs import CHECKPOINTS, Base
 
 NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGXCPU, signal.SIGINT)
@@ -19,7 +17,6 @@ base = "{base}"
 "motor.torque" = [1.5, 2.0, 2.5, 3.0]
 """
 OPTIONS = ("--workers", "1", *CHECKPOINTS)
-_SECONDS_LIVES = 1.05  # of the undisturbed wall time, within which the signal comes
 
 
 def _undisturbed(base: Base) -> tuple[Path, float]:
@@ -35,39 +32,31 @@ def _undisturbed(base: Base) -> tuple[Path, float]:
     return whole, float(timed.read_text())
 
 
-def signalled(base: Base, seed: int, folder: Path) -> Found:
+def asked_to_end(base: Base, seed: int, folder: Path) -> Found:
     """A run or a sweep gets one signal at a random moment of its life, is resumed, and compared to the last bit."""
     chance, directory = random.Random(f"signal {seed}"), folder / "signalled"
     number, swept = NUMBERS[seed % len(NUMBERS)], seed // len(NUMBERS) % 2 == 1
     whole, seconds = _undisturbed(base) if swept else (base.whole, base.seconds)
     what = ("sweep", str(base.folder / "signals.toml"), *OPTIONS) if swept else ("run", str(base.scene), *CHECKPOINTS)
-    after = chance.random() * seconds * _SECONDS_LIVES
-    line = [sys.executable, "-m", "warpflag", *what, "-o", str(directory)]
-    process = subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(after)
-    process.send_signal(number)
-    try:
-        _, said = process.communicate(timeout=PATIENCE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    after = chance.random() * seconds * LIFE
+    end = signalled([*what, "-o", str(directory)], number, after)
+    if end is None:
         return found("traceback", f"{what[0]}: {number.name} after {after:.2f} s: goes on")
-    done = f"{what[0]}: {number.name} after {after:.2f} of {seconds:.2f} s, status {process.returncode}"
+    status, said = end.status, end.said
+    done = f"{what[0]}: {number.name} after {after:.2f} of {seconds:.2f} s, status {status}"
     begun = (directory / ("sweep.toml" if swept else "scene.toml")).exists()
     # Before the program has taken signals over they act as on any process, and nothing has begun.
-    if not begun and (process.returncode == -number or "KeyboardInterrupt" in said):
+    if not begun and (status == -number or "KeyboardInterrupt" in said):
         return found("right", f"{done}: before the program began")
     # Once all is written it hands signals back, and may end by one before it has said so.
-    after_all = (
-        process.returncode == -number and (directory / "table.csv" if swept else directory / "summary.json").exists()
-    )
-    if (process.returncode < 0 and not after_all) or "Traceback" in said:
+    after_all = status == -number and (directory / "table.csv" if swept else directory / "summary.json").exists()
+    if (status < 0 and not after_all) or "Traceback" in said:
         return found("traceback", f"{done}: {said.strip().splitlines()[-1:]}")
-    if process.returncode not in (0, -number, 130 if number == signal.SIGINT else 143):
+    if status not in (0, -number, 130 if number == signal.SIGINT else 143):
         return found("wrong", f"{done}: {said[-200:]}")
     if not begun:
         return found("right", f"{done}: nothing was begun")
-    if process.returncode != 0:
+    if status != 0:
         ended = command(what[0], "--resume", str(directory), *(("--workers", "1") if swept else ()))
         if wrong := problem(ended):
             return found("traceback", f"{done}: resume {wrong}")

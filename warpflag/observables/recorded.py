@@ -17,6 +17,7 @@ __all__ = [
     "Swimming",
     "bundle_lengths",
     "elastic_energies",
+    "motor_torques",
     "phase_profile",
     "steric_force_densities",
     "strains",
@@ -185,12 +186,20 @@ def swimming(record: Record, start: float | None = None, stop: float | None = No
 
 def _motor_power(record: Record, scene: Scene, window: slice, rates: Array) -> float:
     """Mean power of all motors [pN um/s]; where torques are not constant by the trapezoidal rule over the frames."""
-    torques = record.observables.get("motor_torque")
-    if torques is None:
-        return float(2 * np.pi * rates @ [spec.torque for spec in scene.resolved_flagella()])
-    angles, torques = record.motor_angle[window], torques[window]
-    work = 0.5 * (torques[1:] + torques[:-1]) * np.diff(angles, axis=0)
+    torques = motor_torques(record, scene, window)
+    if torques.ndim == 1:
+        return float(2 * np.pi * rates @ torques)
+    work = torques * np.diff(record.motor_angle[window], axis=0)
     return float(work.sum() / elapsed(record.times[window]))
+
+
+def motor_torques(record: Record, scene: Scene, window: slice) -> Array:
+    """Torques of the motors [pN um], shape [flagellum_count] where they are constant; else in each interval of a window
+    of frames, the mean of its two ends, shape [frame_count - 1, flagellum_count]."""
+    measured = record.observables.get("motor_torque")
+    if measured is None:
+        return np.array([spec.torque for spec in scene.resolved_flagella()])
+    return 0.5 * (measured[window][1:] + measured[window][:-1])
 
 
 def _rows(record: Record, flagellum: int) -> slice:

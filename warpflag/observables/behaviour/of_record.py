@@ -13,6 +13,7 @@ from warpflag.observables.behaviour import bundles, load, precession, runs
 from warpflag.observables.behaviour.load import LoadPoint
 from warpflag.observables.behaviour.precession import Wobble
 from warpflag.observables.behaviour.runs import RunsAndTumbles
+from warpflag.observables.recorded import motor_torques
 from warpflag.record import Record
 from warpflag.scene import loads
 
@@ -80,11 +81,7 @@ def motor_loads(record: Record, start: float | None = None, stop: float | None =
         RecordError: the record can't be read.
     """
     window = record.window(start, stop)
-    measured = record.observables.get("motor_torque")
-    if measured is None:
-        torques = np.array([spec.torque for spec in loads(record.scene_text).resolved_flagella()])
-    else:
-        torques = (measured[window][1:] + measured[window][:-1]) / 2
+    torques = motor_torques(record, loads(record.scene_text), window)
     return load.load_points(record.times[window], record.motor_angle[window], torques)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpflag.model.shell import rotne_prager
 from warpflag.observables.arrays import Array, unit
 from warpflag.scene import FlagellumSpec, Scene, SceneError, with_values
 from warpflag.scene.helix import ground_state
@@ -69,26 +70,10 @@ def _mobility(scene: Scene, spec: FlagellumSpec, x: Array) -> Array:
     own = weight * (local.along * along + local.across * (np.eye(3) - along))
     m = np.zeros((count, 3, count, 3))
     if scene.hydrodynamics.mode in ("within", "all", "as_printed", "consistent"):
-        m += _rotne_prager(x, pair_radius(scene, spec.segment_length), scene.fluid.viscosity)
+        a = pair_radius(scene, spec.segment_length)
+        m += rotne_prager(x, a, x, a) / (8 * np.pi * scene.fluid.viscosity)
     m[np.arange(count), :, np.arange(count), :] = own
     return m.reshape(3 * count, 3 * count)
-
-
-def _rotne_prager(x: Array, a: float, viscosity: float) -> Array:
-    """Flows of nodes at each other [um/(s pN)], shape [node, 3, node, 3]; the diagonal is arbitrary.
-
-    Source:
-        Rotne & Prager, J. Chem. Phys. 50, 4831 (1969).
-    """
-    d = x[:, None] - x[None]
-    r = np.linalg.norm(d, axis=-1) + np.eye(len(x))
-    n = d / r[..., None]
-    nn, one = n[..., :, None] * n[..., None, :], np.eye(3)
-    q = (a / r)[..., None, None]
-    far = (1 + 2 / 3 * q**2) * one + (1 - 2 * q**2) * nn
-    far = far / (8 * np.pi * viscosity * r[..., None, None])
-    near = ((1 - 9 / (32 * q)) * one + 3 / (32 * q) * nn) / (6 * np.pi * viscosity * a)
-    return np.where(r[..., None, None] > 2 * a, far, near).transpose(0, 2, 1, 3)
 
 
 def mesh_dependence(scene: Scene, finer: float) -> float | None:
