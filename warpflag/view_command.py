@@ -97,7 +97,7 @@ def plot(options: argparse.Namespace) -> int:
         folder = os.path.dirname(path)
         if os.path.isfile(path) and sweep_figures.is_sweep(folder):  # DIR/* names a sweep's own files, too
             told = f"the sweep: warpflag plot {folder}; its runs side by side: warpflag plot {folder}/0*"
-            return tell(f"{path}: is no run directory; {told}", _BAD_INPUT)
+            return tell(f"{path}: is no run directory; {told}", BAD_INPUT)
     if sweep_figures.is_sweep(options.directories[0]):
         figures.save(sweep_figures.figure(options.directories, options.kind, options.x, options.y), options.output)
         print(options.output)
