@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warpflag.base.forked import Starter
     from warpflag.run.run import Outcome
     from warpflag.run.sweep import SweepRun
 
@@ -87,12 +90,22 @@ def sweep(options: argparse.Namespace) -> Outcome | str:
     from warpflag.run.stop import Stop
 
     limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
-    with Stop(options.max_wall) as stop:
+    with Stop(options.max_wall) as stop, _early_starter(options) as starter:
         started = _started(options)
         if options.slurm or options.slurm_script:
             return _submitted(started, options)
         limits |= {"movies": options.movies, "share": options.share}
-        return started.execute(options.workers, options.device, options.quiet, stop, **limits)
+        return started.execute(options.workers, options.device, options.quiet, stop, starter=starter, **limits)
+
+
+def _early_starter(options: argparse.Namespace) -> contextlib.AbstractContextManager[Starter | None]:
+    """What starts workers on the CPU: it imports while the sweep is read. None where they may get a GPU each."""
+    from warpflag.base.forked import Starter
+
+    gpu = options.device != "cpu" if options.device else os.path.exists("/dev/nvidiactl")
+    if gpu or options.slurm or options.slurm_script or not Starter.works():
+        return contextlib.nullcontext()
+    return contextlib.closing(Starter("warpflag.run.sweep.worker"))
 
 
 def _started(options: argparse.Namespace) -> SweepRun:

@@ -209,15 +209,18 @@ def process(folder: Path, *arguments: str) -> subprocess.Popen:
     )
 
 
-def some_frames(folder: Path) -> bool:
-    """Whether some member has frames but is not done."""
-    return any(not (path.parent / "summary.json").exists() for path in folder.glob("out/0*/checkpoint-*"))
+def some_frames(folder: Path, since: float) -> bool:
+    """Whether some member has a checkpoint that a sweep has written which began at a time."""
+    # The workers of a sweep that was killed write theirs a moment after it.
+    found = [path for path in folder.glob("out/0*/checkpoint-*.npz") if path.exists()]
+    return any(os.path.getmtime(path) > since + 1.0 for path in found if path.exists())
 
 
 def ended(folder: Path, number: int, *arguments: str) -> subprocess.Popen:
     """A sweep that got a signal while some member was under way."""
+    began = time.time()
     started = process(folder, *arguments)
-    while not some_frames(folder) and started.poll() is None:
+    while not some_frames(folder, began) and started.poll() is None:
         time.sleep(0.02)
     started.send_signal(number)
     return started
@@ -251,15 +254,21 @@ def test_a_sweep_that_is_stopped_again_and_again_ends_as_if_it_never_was(tmp_pat
         assert_same_frames(tmp_path / "a/out" / name, tmp_path / "b/out" / name)
 
 
+def children(pid: int) -> list[int]:
+    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True)
+    return [int(child) for child in listed.stdout.split()]
+
+
 def test_a_worker_that_dies_fails_its_batch_alone(tmp_path):
     base = small({"duration": 0.02, "frames": 800})
     (tmp_path / "base.toml").write_text(dumps(base))
     (tmp_path / "sweep.toml").write_text(SWEEP)
+    began = time.time()
     started = process(tmp_path, "sweep.toml", "-o", "out")
-    while not some_frames(tmp_path) and started.poll() is None:
+    while not some_frames(tmp_path, began) and started.poll() is None:
         time.sleep(0.02)
-    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(started.pid)], capture_output=True, text=True)
-    os.kill(int(children.stdout.split()[0]), signal.SIGKILL)
+    starter = children(started.pid)[0]
+    os.kill(children(starter)[0], signal.SIGKILL)
     error = started.communicate()[1]
     assert started.returncode == 1, error
     assert "its worker ended by signal 9" in error

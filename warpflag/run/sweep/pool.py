@@ -17,6 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from warpflag.base.forked import ONE_THREAD, Forked, Starter
 from warpflag.run.member import Outcome
 from warpflag.run.stop import Stop
 from warpflag.scene import Scene, dumps
@@ -24,9 +25,7 @@ from warpflag.scene import Scene, dumps
 __all__ = ["Batch", "Pool", "best_size"]
 
 _SECONDS_PER_LOOK = 0.1  # at the workers: a moment for a person, nothing beside a member
-_COMMAND = [sys.executable, "-m", "warpflag.run.sweep.worker"]
-# A worker is one process of one thread; the libraries below NumPy would start one per core in each.
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_MODULE = "warpflag.run.sweep.worker"
 
 
 @contextlib.contextmanager
@@ -58,24 +57,33 @@ class Batch:
 
 
 class _Worker:
-    """One worker: the process, and the thread that talks with it."""
+    """One worker: the process, and the thread that talks with it.
 
-    def __init__(self, device: str) -> None:
+    Args:
+        device: of its runs.
+        starter: what forks its process; None: it is started anew.
+    """
+
+    def __init__(self, device: str, starter: Starter | None) -> None:
         self.device, self.reached = device, 0.0
         self.thread: threading.Thread | None = None
-        self._started()
+        self._starter = starter
+        self.process = self._started()
 
-    def _started(self) -> None:
+    def _started(self) -> Forked | subprocess.Popen[str]:
+        if self._starter is not None:
+            with contextlib.suppress(OSError):
+                return self._starter.fork()
         # In a session of its own: Ctrl-C reaches the sweep alone, which then ends its workers in order. An interrupt
         # waits until the worker can take it: Python would answer it with a traceback before.
         with _interrupts_blocked():
-            self.process = subprocess.Popen(
-                _COMMAND,
+            return subprocess.Popen(
+                [sys.executable, "-m", _MODULE],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
                 encoding="utf-8",
-                env={**_ONE_THREAD, **os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+                env={**ONE_THREAD, **os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
                 start_new_session=True,
             )
 
@@ -98,7 +106,7 @@ class _Worker:
     def restart(self) -> str:
         """Starts a process anew; returns how the one before it ended."""
         status = self.process.wait()
-        self._started()
+        self.process = self._started()
         return f"its worker ended with status {status}" if status >= 0 else f"its worker ended by signal {-status}"
 
     def close(self) -> None:
@@ -112,15 +120,16 @@ class _Worker:
 
 
 class Pool:
-    """Workers, one per device given; a `with` block starts and ends them.
+    """Workers, one per device given; `start` starts them, and the end of a `with` block ends them.
 
     Args:
         devices: of the workers.
         options: of the runs: movies and checkpoint_seconds.
+        starter: what forks workers on the CPU; ended with the block, too.
     """
 
-    def __init__(self, devices: Sequence[str], options: Mapping[str, Any]) -> None:
-        self.devices, self._options = list(devices), dict(options)
+    def __init__(self, devices: Sequence[str], options: Mapping[str, Any], starter: Starter | None = None) -> None:
+        self.devices, self._options, self._starter = list(devices), dict(options), starter
         self._queue: queue.Queue[Batch] = queue.Queue()
         self._finished: queue.Queue[tuple[Batch, list[Outcome], float]] = queue.Queue()
         self._open, self._done_time, self._ending = 0, 0.0, ""
@@ -128,16 +137,38 @@ class Pool:
         self._batch_ended = threading.Event()
 
     def __enter__(self) -> Pool:
-        self._workers = [_Worker(device) for device in self.devices]
         return self
+
+    def start(self, scene: Scene, stop: Stop, quiet: bool = False) -> None:
+        """Starts the workers; those on the CPU begin with the kernels of a scene loaded.
+
+        Args:
+            scene: of one of the members.
+            stop: what may end it before its time.
+            quiet: say nothing while kernels are compiled.
+        """
+        starter = None
+        if set(self.devices) == {"cpu"} and Starter.works():
+            starter = self._starter = self._starter or Starter(_MODULE)
+            stop.at_once = True
+            try:
+                starter.prepare({"scene": dumps(scene), "quiet": quiet})
+            except OSError:  # each worker by itself, which tells what is wrong
+                starter = None
+            finally:
+                stop.at_once = False
+        self._workers = [_Worker(device, starter) for device in self.devices]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if not self.is_done:
             self.end("terminated")
+        self._ending = self._ending or "done"
         for worker in self._workers:
             worker.close()
+        if self._starter is not None:
+            self._starter.close()
 
     @property
     def is_done(self) -> bool:
@@ -149,17 +180,30 @@ class Pool:
         """Simulated time that all members have reached [s]."""
         return self._done_time + sum(worker.reached for worker in self._workers)
 
-    def measure(self, scenes: Sequence[Scene], stop: Stop, quiet: bool = False) -> tuple[float, float]:
-        """Wall time per cell alone and in a batch [s], measured by the first worker on these scenes."""
+    def measure(self, samples: Sequence[Sequence[Scene]], stop: Stop, quiet: bool = False) -> list[float]:
+        """Wall time per cell of its start and of its run [s], of each sample of scenes advanced together.
+
+        Two workers measure at the same time, as they will run. A sample that can't be run costs nothing: one by one,
+        each member tells what is wrong.
+        """
+        asked = self._workers[: len(samples)]
+        found = [0.0] * len(samples)
+
+        def measure(own: int) -> None:
+            for k in range(own, len(samples), len(asked)):
+                request = {"measure": [dumps(scene) for scene in samples[k]], "device": asked[own].device}
+                found[k] = asked[own].ask({**request, "quiet": quiet}).get("seconds", 0.0)
+
+        threads = [threading.Thread(target=measure, args=(own,), daemon=True) for own in range(len(asked))]
         stop.at_once = True
         try:
-            texts = [dumps(scene) for scene in scenes]
-            answer = self._workers[0].ask({"measure": texts, "device": self.devices[0], "quiet": quiet})
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
         finally:
             stop.at_once = False
-        if "alone" not in answer:  # one by one, so that each member tells what is wrong
-            return 0.0, 0.0
-        return answer["alone"], answer["together"]
+        return found
 
     def submit(self, batch: Batch) -> None:
         """Queues a batch; the workers begin with the first."""

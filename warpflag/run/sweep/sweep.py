@@ -9,6 +9,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from warpflag.base.device import cores, start_warp
+from warpflag.base.forked import Starter
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
 from warpflag.model.build import switches_of
@@ -67,6 +68,7 @@ class SweepRun:
         movies: bool = False,
         share: tuple[int, int] = (0, 1),
         checkpoint_seconds: float | None = None,
+        starter: Starter | None = None,
     ) -> Outcome:
         """Runs what is not finished.
 
@@ -78,6 +80,7 @@ class SweepRun:
             movies: whether each member gets a movie.
             share: (k, n): only the k-th of n equal shares of the members.
             checkpoint_seconds: wall time between two checkpoints [s]; None: as `Run` has it.
+            starter: of workers on the CPU, where one was started before; it is ended, too.
 
         Returns:
             done; stopped, where guards stopped members; failed, where the machine failed some; interrupted or
@@ -85,7 +88,7 @@ class SweepRun:
         """
         if stop is None:
             with Stop() as signals:
-                return self.execute(workers, device, quiet, signals, movies, share, checkpoint_seconds)
+                return self.execute(workers, device, quiet, signals, movies, share, checkpoint_seconds, starter)
         began = monotonic()
         own = range(len(self.members))[share[0] :: share[1]]
         pending = [k for k in own if table.status_of(self.directory / self.names[k]) not in FINISHED]
@@ -94,7 +97,7 @@ class SweepRun:
         if pending:
             self._check_begun(pending)
             options = {"movies": movies, "checkpoint_seconds": checkpoint_seconds}
-            ended, failed = self._run(pending, workers, device, quiet, stop, options)
+            ended, failed = self._run(pending, workers, device, quiet, stop, options, starter)
         self._write_table()
         return self._outcome(own, ended, failed, monotonic() - began)
 
@@ -128,6 +131,7 @@ class SweepRun:
         quiet: bool,
         stop: Stop,
         options: dict[str, Any],
+        starter: Starter | None,
     ) -> tuple[Ended | None, dict[int, str]]:
         devices = [device] if device else _devices()
         count = min(workers or (len(devices) if devices != ["cpu"] else cores()), len(pending))
@@ -135,8 +139,9 @@ class SweepRun:
         failed: dict[int, str] = {}
         written = monotonic()
         ended: Ended | None = None
-        with Pool([devices[k % len(devices)] for k in range(count)], options) as pool:
+        with Pool([devices[k % len(devices)] for k in range(count)], options, starter) as pool:
             try:
+                pool.start(self.members[pending[0]].scene, stop, quiet)
                 size = self._batch_size(pool, pending, count, quiet, stop)
                 for batch in self._batches(pending, size):
                     pool.submit(batch)
@@ -167,7 +172,8 @@ class SweepRun:
         group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
         if len(group) < 2:
             return 1
-        alone, together = pool.measure([self.members[k].scene for k in group], stop, quiet)
+        scenes = [self.members[k].scene for k in group]
+        alone, together = pool.measure([scenes[:1], scenes], stop, quiet)
         kind = "cuda" if pool.devices[0].startswith("cuda") else "cpu"
         size, seconds = best_size(len(pending), workers, alone, together, len(group), _LARGEST_BATCH[kind])
         if not quiet:
@@ -182,9 +188,10 @@ class SweepRun:
     def seconds_per_member(self, pending: Sequence[int], device: str | None, stop: Stop) -> float:
         """Wall time of a member on one worker, the lesser of alone and in a batch, measured on a few of them [s]."""
         group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
+        scenes = [self.members[k].scene for k in group]
         with Pool([device or _devices()[0]], {}) as pool:
-            alone, together = pool.measure([self.members[k].scene for k in group], stop)
-        return min(alone, together)
+            pool.start(scenes[0], stop)
+            return min(pool.measure([scenes[:1], scenes], stop))
 
     def _groups(self, pending: Sequence[int]) -> list[list[int]]:
         """Members that one simulation can advance: the same terms, precision and stepper, all begun or none."""

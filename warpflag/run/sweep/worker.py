@@ -1,9 +1,9 @@
 """A worker of a sweep: a process that runs batches as they come on its standard input, and answers on its output.
 
 Requests and answers are JSON, one a line. A request is a batch: {"directories", "scenes" (TOML texts), "device",
-"options"}; {"measure": [TOML texts], "device", "quiet"} asks what a cell costs alone and in a batch. Answers:
-{"reached"} while it runs [s], then {"outcomes": [[status, message], ...]}; or {"alone", "together"} [s]. At the end of
-its input, also when the process that started it is gone, the worker ends its batch resumable.
+"options"}; {"measure": [TOML texts], "device", "quiet"} asks what a cell of these costs in a batch. Answers:
+{"reached"} while it runs [s], then {"outcomes": [[status, message], ...]}; or {"seconds"}. At the end of its input,
+also when the process that started it is gone, the worker ends its batch resumable.
 """
 
 from __future__ import annotations
@@ -27,11 +27,24 @@ from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Stop
 from warpflag.scene import Scene, loads
 
-__all__ = ["main"]
+__all__ = ["main", "prepare"]
 
 _SECONDS_PER_REPORT = 0.2  # between two reports of the time reached: five a second
-_SAMPLE_SECONDS = 0.3  # of computing, which a sample takes at least: long enough to be timed to some per cent
+_SAMPLE_SECONDS = 0.1  # of computing, which a sample takes at least: long enough to be timed to some per cent
 _FIRST_PART = 64  # the first sample is the simulated time over this; each further one is twice as long
+_loaded: set[str] = set()  # devices on which kernels were loaded before
+
+
+def prepare(given: dict[str, Any]) -> None:
+    """Loads what every worker needs: the modules that a run imports late, and the kernels of a scene.
+
+    Args:
+        given: the scene as TOML, `scene`, and whether it is `quiet` while kernels are compiled.
+    """
+    import h5py  # noqa: F401
+
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # the worker that runs it tells what is wrong
+        _load_kernels(loads(given["scene"]), "cpu", given["quiet"])
 
 
 def main() -> None:
@@ -103,14 +116,17 @@ def _started(directories: list[Path], scenes: list[Scene], request: dict[str, An
     return run.start_batch(scenes, directories, **options)
 
 
+def _load_kernels(scene: Scene, device: str, quiet: bool) -> None:
+    Simulation(scene, device=device).prepare(recording=True, quiet=quiet)
+    _loaded.add(device)
+
+
 def _measured(request: dict[str, Any]) -> dict[str, Any]:
-    """Wall time per cell of its start and of stepping through the whole scene, alone and in a batch [s]."""
+    """Wall time per cell of its start and of stepping through the whole scene [s]."""
     scenes = [loads(text) for text in request["measure"]]
-    Simulation(scenes[0], device=request["device"]).prepare(recording=True, quiet=request["quiet"])  # loads the kernels
-    return {
-        "alone": _cost(scenes[:1], request["device"]),
-        "together": _cost(scenes, request["device"]),
-    }
+    if request["device"] not in _loaded:
+        _load_kernels(scenes[0], request["device"], request["quiet"])
+    return {"seconds": _cost(scenes, request["device"])}
 
 
 def _cost(scenes: list[Scene], device: str | None) -> float:

@@ -1,0 +1,197 @@
+"""Processes that begin prepared: one process imports a module and loads its kernels, and is forked for each of them.
+
+A worker on the CPU is ready 2 s earlier than one that is started anew, and shares the memory of what was loaded. The
+process that is forked has one thread and sees no GPU, whose driver does not survive a fork.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from typing import IO, Any
+
+__all__ = ["ONE_THREAD", "Forked", "Starter"]
+
+# A worker is one process of one thread; the libraries below NumPy would start one per core in each.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_SIGNALS = [
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+    if hasattr(signal, name)
+]
+_LONGEST = 1 << 16  # bytes of an answer
+_DIGITS = 12  # of the length of a request
+
+
+class Starter:
+    """A process that imports a module and forks processes that run the module's `main`.
+
+    It starts to import at once, beside whatever this process does meanwhile.
+
+    Args:
+        module: name of the module. Its `prepare`, of what `prepare` below is given, loads what all processes need.
+    """
+
+    def __init__(self, module: str) -> None:
+        own, other = socket.socketpair()
+        command = [sys.executable, "-m", "warpflag.base.forked", module]
+        hidden = {"CUDA_VISIBLE_DEVICES": ""}
+        path = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+        self._process = subprocess.Popen(
+            command,
+            stdin=other.fileno(),
+            stdout=2,
+            env={**ONE_THREAD, **os.environ, **path, **hidden},
+            start_new_session=True,
+        )
+        other.close()
+        self._socket, self._lock = own, threading.Lock()
+
+    @staticmethod
+    def works() -> bool:
+        """Whether this system forks processes and passes them open files."""
+        return hasattr(os, "fork") and hasattr(socket, "send_fds")
+
+    def prepare(self, given: Any) -> None:
+        """Calls the module's `prepare` in the process, and returns once it is through.
+
+        Args:
+            given: what JSON can hold.
+
+        Raises:
+            OSError: the process has ended.
+        """
+        self._ask({"prepare": given})
+
+    def fork(self) -> Forked:
+        """A new process, with pipes for its standard input and output.
+
+        Raises:
+            OSError: the process that is forked has ended.
+        """
+        (its_input, requests), (answers, its_output) = os.pipe(), os.pipe()
+        try:
+            number = self._ask({"fork": None}, (its_input, its_output))
+        except BaseException:
+            os.close(requests)
+            os.close(answers)
+            raise
+        finally:
+            os.close(its_input)
+            os.close(its_output)
+        return Forked(self, int(number), requests, answers)
+
+    def waited(self, number: int) -> int:
+        """Waits for a process that `fork` gave; its exit status, or minus the signal that ended it."""
+        return int(self._ask({"wait": number}))
+
+    def close(self) -> None:
+        """Ends the process; those that it has started go on."""
+        self._socket.close()
+        with contextlib.suppress(OSError):
+            self._process.kill()
+        self._process.wait()
+
+    def _ask(self, request: dict[str, Any], files: tuple[int, ...] = ()) -> Any:
+        content = json.dumps(request).encode()
+        with self._lock:
+            socket.send_fds(self._socket, [f"{len(content):{_DIGITS}d}".encode()], files)
+            self._socket.sendall(content)
+            answer = self._socket.recv(_LONGEST)
+        if not answer:
+            raise ConnectionError("the process that starts workers has ended")
+        return json.loads(answer)
+
+
+class Forked:
+    """A process that a `Starter` has forked, as `subprocess.Popen` has it.
+
+    Attributes:
+        pid: of the process.
+        stdin: its standard input, to write text to.
+        stdout: its standard output, to read text from.
+    """
+
+    def __init__(self, starter: Starter, pid: int, requests: int, answers: int) -> None:
+        self._starter, self.pid = starter, pid
+        self.stdin: IO[str] | None = os.fdopen(requests, "w", encoding="utf-8")
+        self.stdout: IO[str] | None = os.fdopen(answers, encoding="utf-8")
+        self._status: int | None = None
+
+    def wait(self) -> int:
+        """Its exit status, or minus the signal that ended it."""
+        if self._status is None:
+            try:
+                self._status = self._starter.waited(self.pid)
+            except OSError:  # with the starter goes what it knew
+                self._status = 1
+        return self._status
+
+    def send_signal(self, number: int) -> None:
+        """Sends it a signal, unless it was waited for already."""
+        if self._status is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+
+def _serve(module: Any) -> None:
+    """Answers requests on the standard input, a socket, until it is closed; returns in the processes forked."""
+    own = socket.socket(fileno=os.dup(0))
+    while True:
+        size, files, _, _ = socket.recv_fds(own, _DIGITS, 2)
+        if not size:
+            os._exit(0)
+        content = b""
+        while len(content) < int(size):
+            content += own.recv(int(size) - len(content)) or os._exit(0)
+        request = json.loads(content)
+        answer: Any = None
+        if "prepare" in request:
+            module.prepare(request["prepare"])
+            gc.freeze()  # what was loaded is never copied for the collector's sake
+        elif "wait" in request:
+            _, status = os.waitpid(request["wait"], 0)
+            answer = os.waitstatus_to_exitcode(status)
+        elif (answer := _fork()) == 0:
+            own.close()
+            for number, file in enumerate(files):
+                os.dup2(file, number)
+            for file in files:
+                os.close(file)
+            os.setsid()
+            for number in _SIGNALS:
+                signal.signal(number, signal.SIG_DFL)
+            gc.enable()
+            return
+        for file in files:
+            os.close(file)
+        own.sendall(json.dumps(answer).encode())
+
+
+def _fork() -> int:
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread():
+            thread.join()  # what compiled kernels is about to end
+    return os.fork()
+
+
+def main() -> None:
+    """The process of a `Starter`; the processes that it forks leave it and run the module's `main`."""
+    for number in _SIGNALS:  # it ends with the process that started it, and by nothing else
+        signal.signal(number, signal.SIG_IGN)
+    gc.disable()  # what is imported stays
+    module = importlib.import_module(sys.argv[1])
+    _serve(module)
+    module.main()
+
+
+if __name__ == "__main__":
+    main()
