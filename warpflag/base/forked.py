@@ -167,8 +167,9 @@ def _serve(module: Any) -> None:
             for file in files:
                 os.close(file)
             os.setsid()
-            for number in _SIGNALS:
-                signal.signal(number, signal.SIG_DFL)
+            for signum in _SIGNALS:
+                signal.signal(signum, signal.SIG_DFL)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
             gc.enable()
             return
         for file in files:
@@ -177,16 +178,21 @@ def _serve(module: Any) -> None:
 
 
 def _fork() -> int:
+    """As `os.fork`, of this thread alone; signals are blocked in the new process."""
     for thread in threading.enumerate():
         if thread is not threading.current_thread():
             thread.join()  # what compiled kernels is about to end
-    return os.fork()
+    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # until the new process can take them
+    number = os.fork()
+    if number:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    return number
 
 
 def main() -> None:
     """The process of a `Starter`; the processes that it forks leave it and run the module's `main`."""
     for number in _SIGNALS:  # it ends with the process that started it, and by nothing else
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, lambda *_: None)
     gc.disable()  # what is imported stays
     module = importlib.import_module(sys.argv[1])
     _serve(module)
