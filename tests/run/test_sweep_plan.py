@@ -190,6 +190,14 @@ def test_a_mistyped_key_is_named_once_with_what_was_meant(table, key, folder):
     assert "\n" not in str(refused.value)
 
 
+def test_a_problem_that_members_share_is_told_once(folder):
+    text = "[axes]\nmotor.torque = [1.0, 2.0, 3.0]\n[random]\nflagellum.phase = {low = 0, high = 360}\n"
+    with pytest.raises(BadMembers, match=r"^member 0000 and 2 more: flagella\.phase_difference.*absent"):
+        members(folder, f"[set]\nflagella.phase_difference = 0.6\n{text}")
+    (folder / "base.toml").write_text(dumps(small({"flagella.phase_difference": 0.6})))
+    assert len(members(folder, f'[set]\nflagella.phase_difference = "absent"\n{text}')) == 3
+
+
 def test_of_many_bad_members_the_first_are_named(folder):
     with pytest.raises(BadMembers, match="and 80 more members") as refused:
         members(folder, "[axes]\nmotor.torque = {from = 2e4, to = 3e4, count = 100}\n")

@@ -17,6 +17,8 @@ from typing import Any, ClassVar
 
 from warpflag.scene.errors import Problems, SceneError, shown
 
+ABSENT = "absent"
+"""What takes a value away in place of one, in a sweep or on the command line."""
 # What a number far out of range was probably typed in, the SI unit first:
 # {unit: (plural, ((other unit, factor), ...))}.
 UNIT_SLIPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {
@@ -97,7 +99,7 @@ class Setting:
             SceneError: the value is not allowed.
         """
         value = _plain(value)
-        if value is None and self.derived:
+        if self.derived and (value is None or (value == ABSENT and self.kind != "text")):
             return None
         if self.kind == "vector" and isinstance(value, list | tuple) and len(value) == 3:
             return tuple(float(self._number(key, value, _plain(item))) for item in value)

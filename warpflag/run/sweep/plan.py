@@ -47,18 +47,26 @@ class BadMembers(ValueError):
     """Members that can't be simulated: one line each, of the first."""
 
 
-def check_members(bad: Sequence[str]) -> None:
+def check_members(bad: Mapping[str, SceneError]) -> None:
     """That nothing is wrong with any member.
 
     Args:
-        bad: a line for each that can't be simulated.
+        bad: what is wrong, by the name of the member.
 
     Raises:
-        BadMembers: with the first lines, and how many more there are.
+        BadMembers: a line for each of the first problems, with the first member that has it.
     """
-    if bad:
-        more = [f"and {len(bad) - MOST_PROBLEMS} more members"] if len(bad) > MOST_PROBLEMS else []
-        raise BadMembers("\n".join([*bad[:MOST_PROBLEMS], *more]))
+    members: dict[str, list[str]] = {}
+    for name, error in bad.items():
+        members.setdefault(str(error), []).append(name)
+    lines = [
+        f"{own[0]}{f' and {len(own) - 1} more' if len(own) > 1 else ''}: {problem}" for problem, own in members.items()
+    ]
+    if len(lines) > MOST_PROBLEMS:
+        left = list(members.values())[MOST_PROBLEMS:]
+        lines[MOST_PROBLEMS:] = [f"and {sum(map(len, left))} more members"]
+    if lines:
+        raise BadMembers("\n".join(lines))
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,7 @@ class Sweep:
         if size > _MOST_MEMBERS:
             raise SceneError("axes", list(self.axes), f"make {size} members; at most {_MOST_MEMBERS} are allowed")
         members: list[Member] = []
-        bad: list[str] = []
+        bad: dict[str, SceneError] = {}
         width = max(4, len(str(size - 1)))
         combinations = itertools.product(*self.axes.values())
         for point, (combination, draw) in enumerate(itertools.product(combinations, range(random.count))):
@@ -131,7 +139,7 @@ class Sweep:
                     values = axes | random.values(own, draw, repeat)
                     scene = with_values(self.base, {**values, "name": f"{self.base.name}-{number:0{width}d}"})
                 except SceneError as error:
-                    bad.append(f"{label}: {error}")
+                    bad[label] = error
                     continue
                 members.append(Member(number, point, repeat, values, scene))
         check_members(bad)

@@ -303,14 +303,14 @@ def _check_starts(members: Sequence[Member]) -> None:
     Raises:
         BadMembers: some have none.
     """
-    bad, starts = [], Starts()
+    bad, starts = {}, Starts()
     for member in members:
         try:
             starts.of(member.scene)
             for spec in member.scene.resolved_flagella():
                 filament_mobility(member.scene, spec.segment_length)
         except SceneError as error:
-            bad.append(f"{member.scene.name}: {error}")
+            bad[member.scene.name] = error
     check_members(bad)
 
 
