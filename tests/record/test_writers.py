@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
-from warpflag.record import Record, RecordError
+from warpflag.record import Record, RecordError, new_record
+from warpflag.record import recorder as recorder_module
+from warpflag.record.layout import E1, POSITION
 from warpflag.record.recorder import Recorder
 
 WRITER = """
@@ -169,7 +171,7 @@ def test_a_record_that_is_closed_between_blocks(tmp_path):
         first.write(frame(index))
     assert len(os.listdir("/dev/fd")) == files
     with Record(first.path) as record:
-        assert_holds_frames(record, range(5))
+        assert_holds_frames(record, range(4))
     first.flush()
     first.flush()
     with Record(first.path) as record:
@@ -185,3 +187,69 @@ def test_a_record_that_is_closed_between_blocks(tmp_path):
     resumed.close()
     with Record(second.path) as record:
         assert_holds_frames(record, range(6))
+
+
+def contents(path: Path) -> dict[str, object]:
+    """Everything in a file: values, types and attributes, by path."""
+    found: dict[str, object] = {}
+    with h5py.File(path) as file:
+
+        def look(name: str, item: object) -> None:
+            attributes = {
+                key: np.asarray(value).tolist() for key, value in item.attrs.items() if not key.endswith("_LIST")
+            }
+            data = (item.dtype.str, item.chunks, item[()].tolist()) if isinstance(item, h5py.Dataset) else None
+            found[name] = (attributes, data)
+
+        file.visititems(look)
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 3, 64, 65, 150])
+def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written(tmp_path, count, monkeypatch):
+    """Records of a batch begin with the bytes of the first of them, with their own numbers in place."""
+    monkeypatch.setattr(new_record, "_templates", {})
+    for k in range(3):
+        at_once, each = (
+            started(tmp_path / f"{name}-{k}.h5", block_frames=count, keep_open=False) for name in ("at once", "each")
+        )
+        each._block_frames = 1
+        for recorder in (at_once, each):
+            scene, size = f'name = "{k}"  # of a length of its own{"!" * (k // 2)}\n', 1.0 + k
+            options = {"filament_radius": size, "body_length": 2 * size, "body_width": 0.5, "versions": {"h5py": "3"}}
+            recorder.start(scene, FIRST_NODE, **options)
+            for index in range(count):
+                recorder.write(frame(7 * k + index))
+            recorder.close()
+        assert contents(at_once.path) == contents(each.path)
+        with Record(at_once.path) as record:
+            assert_holds_frames(record, range(7 * k, 7 * k + count))
+            assert record.scene_text == scene and record.filament_radius == size
+        more = started(at_once.path, resume_step=10 * (7 * k + count - 1), keep_open=False)
+        more.write(frame(7 * k + count))
+        more.close()
+        with Record(at_once.path) as record:
+            assert_holds_frames(record, range(7 * k, 7 * k + count + 1))
+    assert len(new_record._templates) == (2 if count == 1 else 4)  # two lengths of the text, all frames and one
+
+
+def test_what_is_small_is_kept_until_a_record_is_long_or_continued(tmp_path, monkeypatch):
+    recorder = started(tmp_path / "run.h5", block_frames=3)
+    for index in range(7):
+        recorder.write(frame(index))
+    recorder.close()
+    with Record(recorder.path) as record:
+        kept = recorder.kept()
+        assert set(kept) == set(record.entries) - {POSITION, E1, "checksums"}
+        assert kept["time"].tolist() == record.times.tolist() and kept["step"].tolist() == record.steps.tolist()
+        assert kept["observables/motor_rate"].tolist() == record.observables["motor_rate"].tolist()
+    continued = started(recorder.path, resume_step=30)
+    continued.write(frame(4))
+    continued.close()
+    assert continued.kept() is None
+    monkeypatch.setattr(recorder_module, "_MOST_KEPT", 5)
+    long = started(tmp_path / "long.h5")
+    for index in range(7):
+        long.write(frame(index))
+    long.close()
+    assert long.kept() is None

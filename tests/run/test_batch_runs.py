@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import signal
 from pathlib import Path
@@ -9,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.runs import arrays, assert_same_frames, frame_by_frame, small, summary
+from tests.runs import arrays, assert_same_frames, executed, frame_by_frame, small, summary
 from warpflag import observables
 from warpflag.record import Record
-from warpflag.run import run
+from warpflag.run import checkpoint, execute, run
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, dumps, load
 
@@ -205,3 +206,18 @@ def test_a_record_of_a_batch_keeps_no_file_open(tmp_path):
         batch.execute_all(quiet=True, watch=watch)
     assert opened == set()
     assert len(arrays(made[0])["times"]) == 9
+
+
+def test_a_file_system_that_can_not_be_synced_as_a_whole_has_each_file_synced(tmp_path, monkeypatch):
+    def refuse(folders):
+        raise OSError(errno.EIO, "of another's file")
+
+    monkeypatch.setattr(execute, "sync_file_systems", refuse)
+    made, alone = directories(tmp_path / "batch", 2), directories(tmp_path / "alone", 2)
+    ended = run.start_batch(members()[:2], made, "cpu", movies=False, checkpoint_seconds=0.0).execute_all(quiet=True)
+    assert {outcome.status for outcome in ended} == {"done"}
+    for scene, own, other in zip(members()[:2], made, alone, strict=True):
+        assert_same_frames(executed(scene, other), own)
+        assert checkpoint.exists(own) and not (own / "checkpoint.tmp").exists()
+        again = run.resume_batch([own], ["duration=2e-4"], "cpu", movies=False).execute_all(quiet=True)
+        assert again[0].status == "done"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -86,3 +87,27 @@ def test_objects_are_refused_when_saved(tmp_path):
     with pytest.raises(ValueError, match="positions"):
         checkpoint.save(tmp_path, {"positions": np.array([None])}, {})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_is_a_file_as_numpy_writes_it(tmp_path, monkeypatch):
+    random = np.random.default_rng(3)
+    arrays = {
+        "a.µ": random.standard_normal((3, 4)),
+        "none": np.zeros((0, 3)),
+        "one": np.array(7),
+        "turned": np.asfortranarray(random.standard_normal((4, 5)))[::2],
+        "text": np.array(["x", "yz"]),
+        "flags": np.array([True, False]),
+    }
+    path = checkpoint.save(tmp_path, arrays, {"step": 1})
+    with zipfile.ZipFile(path) as file:
+        assert file.testzip() is None
+    monkeypatch.setattr(checkpoint, "_LONGEST_ZIP", 100)  # what is longer, NumPy writes itself
+    other = checkpoint.save(tmp_path, arrays, {"step": 1})
+    with np.load(path) as own, np.load(other) as numpys:
+        assert own.files == numpys.files
+        for name in own.files:
+            assert own[name].dtype == numpys[name].dtype and own[name].shape == numpys[name].shape
+            np.testing.assert_array_equal(own[name], numpys[name])
+    arrays_again, meta = checkpoint.load(tmp_path)
+    assert meta == {"step": 1} and arrays_again["one"] == 7

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["DiskError", "OutputError", "machine_error", "missing", "whole"]
+__all__ = ["DiskError", "OutputError", "machine_error", "missing", "sync_file_systems", "whole"]
 
 
 class OutputError(ValueError):
@@ -64,6 +65,27 @@ def whole(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def sync_file_systems(folders: Iterable[Path]) -> None:
+    """Returns once all that was written so far where these folders lie would survive a power cut.
+
+    For many files that takes a small part of the time that syncing each takes.
+
+    Raises:
+        OSError: a device could not store it.
+    """
+    for folder in {os.stat(folder).st_dev: folder for folder in folders}.values():
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            sync = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
+            if sync is None:
+                os.sync()
+            elif sync(descriptor) != 0:
+                number = ctypes.get_errno()
+                raise OSError(number, os.strerror(number), str(folder))
+        finally:
+            os.close(descriptor)
 
 
 def machine_error(error: OSError) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from warpflag.record.layout import (
     BODY_ORIENTATION,
@@ -19,7 +20,6 @@ from warpflag.record.layout import (
     POSITION,
     UNITS,
     Frame,
-    checksums,
     dataset_path,
     parameters_checksum,
 )
@@ -32,11 +32,12 @@ FORMAT = ("v108", "v108")
 while it is written, and one whose writer was killed can't be opened again."""
 
 _CHUNK_BYTES = 1 << 20  # of a chunk, for 16 to 64 frames: HDF5's cache of chunks holds one
-_WHOLE = {"step": np.int64, FORM: np.int8}  # types of whole numbers by entry
 _NUMBERS = itertools.count()
 _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
 _TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
+_TEMPLATE_BYTES = 1 << 26  # of all templates that are kept: those of a batch, whose texts differ by some letters
+_templates: dict[Any, _Template] = {}
 
 
 def values_of(frame: Frame) -> dict[str, Any]:
@@ -54,63 +55,122 @@ def values_of(frame: Frame) -> dict[str, Any]:
     return found if frame.forms is None else {**found, FORM: np.array(frame.forms, dtype=np.int8)}
 
 
-def first_image(values: Mapping[str, Any], parameters: Mapping[str, Any]) -> bytes:
-    """The bytes of a record of one frame.
+def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> bytes:
+    """The bytes of a new record with its first frames.
+
+    Records of cells that are alike differ in a few numbers: they are put in their places in the bytes of one that HDF5
+    has made.
 
     Args:
-        values: of the frame, by entry, as `values_of` gives them.
+        rows: of the frames, by entry, frames first, checksums among them.
         parameters: what /parameters holds.
 
     Raises:
-        ValueError: the frame has other nodes or flagella than the parameters say.
+        ValueError: the frames have other nodes or flagella than the parameters say.
     """
     nodes, flagella = int(parameters["first_node"][-1]), len(parameters["first_node"]) - 1
     for name, shape in {POSITION: (nodes, 3), E1: (nodes, 3), MOTOR_ANGLE: (flagella,)}.items():
-        if np.shape(values[name]) != shape:
-            raise ValueError(f"{name} of a frame has shape {np.shape(values[name])}, the scene's is {shape}")
-    sums = np.array([checksums(np.asarray(value)[None])[0] for value in values.values()], dtype=np.uint32)
-    version = parameters["versions"].get("warpflag", "unknown")
-    with _in_memory(_empty_image(tuple((name, np.shape(value)) for name, value in values.items()), version)) as file:
-        for name, value in {**values, CHECKSUMS: sums}.items():
-            Rows(file, name).write(0, np.asarray(value)[None])
-        add_parameters(file, parameters)
-        file.flush()
-        return file.id.get_file_image()
+        if rows[name].shape[1:] != shape:
+            raise ValueError(f"{name} of a frame has shape {rows[name].shape[1:]}, the scene's is {shape}")
+    shapes = tuple((name, values.shape) for name, values in rows.items())
+    kept = tuple((name, _stored(value).shape, _stored(value).dtype.str) for name, value in _plain(parameters).items())
+    key = (shapes, kept, tuple(parameters["versions"].items()))
+    template = _templates.get(key)
+    if template is None:
+        template = _Template.made(rows, parameters)
+        if sum(len(other.image) for other in list(_templates.values())) > _TEMPLATE_BYTES:
+            _templates.clear()
+        _templates[key] = template
+    return template.filled(rows, parameters)
 
 
-@functools.lru_cache(maxsize=16)
-def _empty_image(shapes: tuple[tuple[str, tuple[int, ...]], ...], version: str) -> bytes:
-    """A record of one frame of zeros without /parameters: the same for all cells of a batch that are alike.
+def _plain(parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters that are datasets."""
+    return {name: value for name, value in parameters.items() if name != "versions"}
 
-    Args:
-        shapes: of the entries of a frame, by name.
-        version: of this program.
+
+def _stored(value: Any) -> NDArray[Any]:
+    """A parameter as its dataset holds it."""
+    return np.asarray(_text(value) if isinstance(value, str) else value)
+
+
+@dataclass(frozen=True)
+class _Template:
+    """A record as HDF5 has made it, and where its numbers lie.
+
+    Attributes:
+        image: its bytes.
+        rows: by entry, the type of its numbers, frames of a chunk, and where each chunk begins.
+        parameters: by name, where its bytes begin.
     """
-    with _in_memory() as file:
-        file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
-        file.create_group("h5md/author").attrs["name"] = _text("unknown")
-        creator = file.create_group("h5md/creator")
-        creator.attrs["name"] = _text("warpflag")
-        creator.attrs["version"] = _text(version)
-        box = file.create_group("particles/flagella/box")
-        box.attrs["dimension"] = np.int32(3)
-        box.attrs["boundary"] = np.array([_text("none")] * 3)
-        empty = {name: np.zeros(shape, dtype=_WHOLE.get(name, np.float64)) for name, shape in shapes}
-        # The shared datasets first, under the entry that every record has.
-        for name in ("step", "time", *(name for name in empty if name not in ("step", "time"))):
-            _add_dataset(file, name, empty[name])
-        file.create_group("h5md/modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
-        time: Any = file[dataset_path("time")]
-        time.make_scale("time")
-        for name in empty:
-            _describe(file[dataset_path(name)], name, time)
-        for name in empty.keys() - {"step", "time", POSITION}:
-            file[f"{name}/step"] = file[dataset_path("step")]
-            file[f"{name}/time"] = time
-        sums = _add_dataset(file, CHECKSUMS, np.zeros(len(empty), dtype=np.uint32))
-        sums.attrs["entries"] = np.array([_text(name) for name in empty])
-        file.flush()
-        return file.id.get_file_image()
+
+    image: bytes
+    rows: dict[str, tuple[np.dtype[Any], int, list[int]]]
+    parameters: dict[str, int]
+
+    @classmethod
+    def made(cls, rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> _Template:
+        """That of records which have frames and parameters of these shapes."""
+        with _in_memory() as file:
+            _fill(file, rows, parameters["versions"].get("warpflag", "unknown"))
+            add_parameters(file, parameters)
+            file.flush()
+            found = {}
+            for name in rows:
+                dataset = file[dataset_path(name)]
+                chunks = [dataset.id.get_chunk_info(k) for k in range(dataset.id.get_num_chunks())]
+                places = [chunk.byte_offset for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_offset)]
+                found[name] = dataset.dtype, dataset.chunks[0], places
+            places = {name: file[f"parameters/{name}"].id.get_offset() for name in _plain(parameters)}
+            return cls(file.id.get_file_image(), found, places)
+
+    def filled(self, rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> bytes:
+        """The bytes of a record with other numbers of these shapes."""
+        from h5py import h5a  # pyright: ignore[reportAttributeAccessIssue]
+
+        image = bytearray(self.image)
+
+        def put(place: int, values: NDArray[Any]) -> None:
+            content = values.tobytes()
+            image[place : place + len(content)] = content
+
+        for name, (dtype, chunk, places) in self.rows.items():
+            values = np.ascontiguousarray(rows[name], dtype=dtype)
+            for k, place in enumerate(places):
+                put(place, values[k * chunk : (k + 1) * chunk])
+        for name, place in self.parameters.items():
+            put(place, _stored(parameters[name]))
+        with _in_memory(bytes(image)) as file:
+            total = h5a.open(file["parameters"].id, b"checksum")
+            total.write(np.array(parameters_checksum(parameters), dtype=np.uint32))
+            file.flush()
+            return file.id.get_file_image()
+
+
+def _fill(file: Any, rows: Mapping[str, NDArray[Any]], version: str) -> None:
+    """Writes a record without /parameters into an empty file of HDF5."""
+    file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
+    file.create_group("h5md/author").attrs["name"] = _text("unknown")
+    creator = file.create_group("h5md/creator")
+    creator.attrs["name"] = _text("warpflag")
+    creator.attrs["version"] = _text(version)
+    box = file.create_group("particles/flagella/box")
+    box.attrs["dimension"] = np.int32(3)
+    box.attrs["boundary"] = np.array([_text("none")] * 3)
+    # The shared datasets first, under the entry that every record has.
+    entries = ["step", "time", *(name for name in rows if name not in ("step", "time", CHECKSUMS))]
+    for name in entries:
+        _add_dataset(file, name, rows[name])
+    file.create_group("h5md/modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
+    time: Any = file[dataset_path("time")]
+    time.make_scale("time")
+    for name in entries:
+        _describe(file[dataset_path(name)], name, time)
+    for name in set(entries) - {"step", "time", POSITION}:
+        file[f"{name}/step"] = file[dataset_path("step")]
+        file[f"{name}/time"] = time
+    sums = _add_dataset(file, CHECKSUMS, rows[CHECKSUMS])
+    sums.attrs["entries"] = np.array([_text(name) for name in rows if name != CHECKSUMS])
 
 
 def _in_memory(image: bytes | None = None) -> Any:
@@ -164,12 +224,11 @@ def growth(datasets: Iterable[Rows], before: int, after: int) -> int:
     return total
 
 
-def _add_dataset(file: Any, name: str, value: Any) -> Any:
-    """A dataset of frames whose first is `value`, in chunks of 16 to 64 frames."""
-    first = np.asarray(value)[None]
-    chunk = int(np.clip(_CHUNK_BYTES // max(1, first.nbytes), 16, 64))
-    shape = first.shape[1:]
-    return file.create_dataset(dataset_path(name), data=first, maxshape=(None, *shape), chunks=(chunk, *shape))
+def _add_dataset(file: Any, name: str, rows: NDArray[Any]) -> Any:
+    """A dataset of frames that begins with some, in chunks of 16 to 64 frames."""
+    shape = rows.shape[1:]
+    chunk = int(np.clip(_CHUNK_BYTES // max(1, rows[:1].nbytes), 16, 64))
+    return file.create_dataset(dataset_path(name), data=rows, maxshape=(None, *shape), chunks=(chunk, *shape))
 
 
 def _describe(dataset: Any, name: str, time: Any) -> None:

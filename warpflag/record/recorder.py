@@ -18,12 +18,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from warpflag.base.output import DiskError
 from warpflag.record.disk import DiskFile
 from warpflag.record.layout import (
     CHECKSUMS,
+    E1,
+    FORM,
+    POSITION,
     Frame,
     RecordError,
     checksums,
@@ -37,6 +40,7 @@ from warpflag.record.rows import Rows
 
 __all__ = ["Recorder"]
 
+_MOST_KEPT = 1000  # frames: 0.2 MB of a cell with two flagella
 _BLOCK_SECONDS = 2.0  # after which pending frames are committed: what a killed run loses at most
 
 
@@ -51,7 +55,7 @@ class Recorder:
         resume_step: continue an existing file: frames whose step is larger are cut off and new ones appended.
         block_frames: frames of a block.
         keep_open: whether the file stays open and locked between blocks. If not, only full blocks and calls of `flush`
-            are committed: thousands of records can then be written at once.
+            are committed, the first ones, too: thousands of records can then be written at once.
         clock: seconds that pass, for tests.
     """
 
@@ -69,6 +73,7 @@ class Recorder:
         self._block_frames, self._keep_open = block_frames, keep_open
         self._clock = clock
         self._started = False  # the file is there, open or not
+        self._kept: dict[str, list[NDArray[Any]]] | None = {}
         self._file: Any = None
         self._disk: DiskFile | None = None
         self._parameters: dict[str, Any] = {}
@@ -133,29 +138,34 @@ class Recorder:
         """
         values = values_of(frame)
         self._last_step = frame.step
-        if not self._started:
-            self._create(values)
-            return
         shapes = {name: np.shape(value) for name, value in values.items()}
+        if not (self._started or self._pending):
+            self._refuse_existing()
+        if not self._shapes:
+            self._summed = list(values)
+            self._shapes = {**shapes, CHECKSUMS: (len(values),)}
         expected = {name: shape for name, shape in self._shapes.items() if name != CHECKSUMS}
         if shapes != expected:
             wrong = sorted(name for name, _ in shapes.items() ^ expected.items())
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
         self._pending.append(values)
-        late = self._keep_open and self._clock() - self._last_commit > _BLOCK_SECONDS
+        late = self._keep_open and not (self._started and self._clock() - self._last_commit <= _BLOCK_SECONDS)
         if late or len(self._pending) >= self._block_frames:
             self._commit()
 
-    def flush(self) -> None:
+    def flush(self, sync: bool = True) -> None:
         """Commits the frames that are pending: from here on they survive the end of this process and a power cut.
+
+        Args:
+            sync: whether a power cut, too; if not, `mark_synced` tells that something else has seen to it.
 
         Raises:
             DiskError: they could not be written; all committed before stay readable.
         """
-        if not self._started:
+        if not (self._started or self._pending):
             return
         self._commit()
-        if self._synced:
+        if self._synced or not sync:
             return
         disk = self._disk or DiskFile(self.path)
         try:
@@ -163,6 +173,10 @@ class Recorder:
         finally:
             if disk is not self._disk:
                 disk.close()
+        self._synced = True
+
+    def mark_synced(self) -> None:
+        """Tells that all that is committed would survive a power cut."""
         self._synced = True
 
     def close(self) -> None:
@@ -183,15 +197,26 @@ class Recorder:
         """Writes the pending frames and their checksums, flushes, and then writes `step`, the mark of the commit."""
         if not self._pending:
             return
-        if self._file is None:
-            self._open(DiskFile(self.path), list(self._shapes))
-        assert self._disk is not None and self._file is not None
         # Rows start at the committed count, not at a dataset's end: a commit that was interrupted is
         # repeated.
         count = self._committed + len(self._pending)
         rows = {name: np.stack([values[name] for values in self._pending]) for name in self._pending[0]}
         if CHECKSUMS in self._shapes:
             rows[CHECKSUMS] = np.stack([checksums(rows[name]) for name in self._summed], axis=1)
+        if not self._started:
+            self._create(rows)
+        else:
+            self._append(rows, count)
+        self._keep(rows, count)
+        self._committed, self._pending, self._last_commit = count, [], self._clock()
+        if not self._keep_open:
+            self._release()
+
+    def _append(self, rows: Mapping[str, NDArray[Any]], count: int) -> None:
+        """Adds rows to a file that exists, which has `count` frames then."""
+        if self._file is None:
+            self._open(DiskFile(self.path), list(self._shapes))
+        assert self._disk is not None and self._file is not None
         self._disk.reserve(self._file.id.get_filesize() + growth(self._datasets.values(), self._committed, count))
         try:
             for group in ([name for name in self._shapes if name != "step"], ["step"]):
@@ -201,11 +226,25 @@ class Recorder:
         except (OSError, RuntimeError) as error:  # h5py raises either
             self._abandon()
             raise DiskError.of(self.path, error) from error
-        self._committed, self._synced = count, False
-        self._pending = []
-        self._last_commit = self._clock()
-        if not self._keep_open:
-            self._release()
+        self._synced = False
+
+    def _keep(self, rows: Mapping[str, NDArray[Any]], count: int) -> None:
+        """Keeps what is small of a record that is not long."""
+        if count > _MOST_KEPT or (self._committed and not self._kept):
+            self._kept = None
+        if self._kept is not None:
+            for name in rows.keys() - {POSITION, E1, FORM, CHECKSUMS}:
+                self._kept.setdefault(name, []).append(rows[name])
+
+    def kept(self) -> dict[str, NDArray[Any]] | None:
+        """All committed frames of the small entries by name, frames first, without a look at the file.
+
+        Returns:
+            All but positions, directors and forms; None of a record that is long or was continued.
+        """
+        if not self._kept:
+            return None
+        return {name: np.concatenate(parts) for name, parts in self._kept.items()}
 
     def _abandon(self) -> None:
         """Closes HDF5's file after a write that failed; what it still writes goes nowhere, and can't fail again."""
@@ -240,31 +279,33 @@ class Recorder:
                 f"{self.path}: exists already, and records are never overwritten; name another or remove it"
             )
 
-    def _create(self, values: dict[str, Any]) -> None:
-        """Makes the file with its first frame, in memory and then under a temporary name: it is never there in part.
+    def _create(self, rows: Mapping[str, NDArray[Any]]) -> None:
+        """Makes the file with its first frames, in memory and then under a temporary name: it is never there in part.
 
         Raises:
             RecordError: the file exists.
             DiskError: it could not be written; there is none then.
         """
+        pending, shapes = self._pending, self._shapes
+        self._pending, self._shapes = [], {}  # nothing is kept of frames that can't be written
         self._refuse_existing()
-        image = first_image(values, self._parameters)
+        image = first_image(rows, self._parameters)
         temporary = self.path.with_name(self.path.name + ".tmp")
         try:
             with open(temporary, "wb") as file:
                 file.write(image)
-                file.flush()
-                os.fsync(file.fileno())
+                if self._keep_open:
+                    file.flush()
+                    os.fsync(file.fileno())
             os.replace(temporary, self.path)
         except OSError as error:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise DiskError.of(self.path, error) from error
-        self._summed = list(values)
-        self._shapes = {**{name: np.shape(value) for name, value in values.items()}, CHECKSUMS: (len(values),)}
+        self._pending, self._shapes = pending, shapes
         if self._keep_open:
             self._open(DiskFile(self.path), list(self._shapes))
-        self._started, self._committed, self._synced, self._last_commit = True, 1, True, self._clock()
+        self._started, self._synced = True, self._keep_open
 
     def _reopen(self, resume_step: int) -> None:
         """Opens an existing file and cuts it to the frames with step <= resume_step."""

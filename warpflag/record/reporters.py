@@ -51,18 +51,19 @@ class Reporter(Protocol):
         ...
 
 
-def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray) -> None:
+def start_reporter(reporter: Reporter, scene: Scene, first_node: np.ndarray, text: str | None = None) -> None:
     """Starts a reporter for a run of one scene.
 
     Args:
         reporter: the reporter.
         scene: what is run.
         first_node: flagellum k has the nodes first_node[k] to first_node[k + 1] - 1, shape [flagellum_count + 1].
+        text: the scene as TOML, where it is at hand.
     """
     thick = 2 * scene.flagella.filament_radius
     length, width = (scene.body.length, scene.body.width) if scene.body.enabled else (thick, thick)
     reporter.start(
-        dumps(scene),
+        text or dumps(scene),
         first_node,
         filament_radius=scene.flagella.filament_radius,
         body_length=length,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from warpflag_kernels.stepping.health import Fault
 
+from warpflag.base.output import sync_file_systems
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
 from warpflag.record import Frame, Record, RecordError
@@ -244,9 +245,20 @@ class Run:
 
         def save(cell: int) -> None:
             copied = self.simulation.part(self._copy, cell)
-            self._guarded(cell, lambda: self.members[cell].save(copied, self.simulation.device.alias))
+            device = self.simulation.device.alias
+            self._guarded(cell, lambda: self.members[cell].save(copied, device, sync=alone))
 
+        alone = len(self.members) == 1
         self._of_each(cells, save)
+        going_on = [cell for cell in cells if self.members[cell].outcome is None]
+        if alone or not going_on:
+            return
+        try:
+            sync_file_systems(self.members[cell].directory for cell in going_on)
+            synced = True
+        except OSError:  # perhaps of a file that is none of these
+            synced = False
+        self._of_each(going_on, lambda cell: self._guarded(cell, lambda: self.members[cell].saved(synced)))
 
     def _first_node(self, cell: int) -> np.ndarray:
         """Where each flagellum of a cell begins in its record, shape [flagellum_count + 1]."""

@@ -26,7 +26,7 @@ from warpflag.run.lock import Lock
 from warpflag.run.run_directory import MOVIE_NAME, SUMMARY_NAME, settings_sha256, write_whole
 from warpflag.run.stop import Ended
 from warpflag.run.summary import digest, kept_words, plain
-from warpflag.scene import Scene
+from warpflag.scene import Scene, dumps
 
 __all__ = ["Member", "Outcome"]
 
@@ -71,6 +71,7 @@ class Member:
         self.outcome: Outcome | None = None
         self._lock = lock
         self._saved_step = resumed["step"] if resumed else -1
+        self._unnamed = False  # a checkpoint is written that has not its name yet
         self._began = monotonic() - (resumed["wall_time"] if resumed else 0.0)
         step = resumed["step"] if resumed else None
         self.recorder = Recorder(
@@ -84,11 +85,16 @@ class Member:
 
     @functools.cached_property
     def _settings_sha256(self) -> str:
-        return settings_sha256(self.scene)
+        return settings_sha256(self.scene, self.text)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """The scene as TOML."""
+        return dumps(self.scene)
 
     def start(self, first_node: np.ndarray) -> None:
         """Opens the record; flagellum k has the nodes first_node[k] to first_node[k + 1] - 1."""
-        start_reporter(self.recorder, self.scene, first_node)
+        start_reporter(self.recorder, self.scene, first_node, self.text)
 
     def write(self, frame: Frame) -> bool:
         """Records a frame; returns whether it was the last of the scene.
@@ -102,12 +108,13 @@ class Member:
         self.recorder.write(frame)
         return self.recorder.frame_count == self.scene.frames + 1
 
-    def save(self, arrays: Mapping[str, np.ndarray], device: str) -> None:
+    def save(self, arrays: Mapping[str, np.ndarray], device: str, sync: bool = True) -> None:
         """Writes a checkpoint, the frames before it first; the one of the last checkpoint's step is there already.
 
         Args:
             arrays: the checkpoint of the cell when all frames up to its time were recorded.
             device: that it was computed on.
+            sync: whether it is then safe from a power cut; if not, it takes its place with `saved`, once it is.
         """
         step, time = int(arrays["control.steps"][0]), float(arrays["frame.time"][0])
         if step == self._saved_step:
@@ -120,9 +127,27 @@ class Member:
             "settings_sha256": self._settings_sha256,
             "versions": versions(),
         }
-        self.recorder.flush()
-        checkpoint.save(self.directory, arrays, meta)
+        self.recorder.flush(sync)
+        if sync:
+            checkpoint.save(self.directory, arrays, meta)
+        else:
+            checkpoint.write(self.directory, arrays, meta, sync=False)
+            self._unnamed = True
         self._saved_step = step
+
+    def saved(self, synced: bool) -> None:
+        """Gives a checkpoint that `save` has written without `sync` its place.
+
+        Args:
+            synced: whether all that was written so far is safe from a power cut; if not, it is afterwards.
+        """
+        if synced:
+            self.recorder.mark_synced()
+        else:
+            self.recorder.flush()
+        if self._unnamed:
+            checkpoint.name(self.directory, sync=not synced)
+            self._unnamed = False
 
     def finish(
         self,
@@ -176,7 +201,7 @@ class Member:
                 return f"{how} before a new frame, those of before are kept; resumable with --resume {self.directory}"
             return f"{how} before the first frame; start again with --resume {self.directory}"
         with Record(self.directory) as record:
-            found, grown, taken = digest(record, self.scene), follow(record), self.wall_time
+            found, grown, taken = digest(record, self.scene, self.recorder.kept()), follow(record), self.wall_time
             growth = {"factor": grown.factor, "from": grown.start, "within": grown.within} if grown else None
             ending = {"status": status, "message": str(fault) if fault else "", "wall_time": taken}
             summary = {**ending, **facts, "growth": growth, **found}

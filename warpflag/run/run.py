@@ -31,7 +31,7 @@ from warpflag.run.run_directory import (
     write_whole,
 )
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene, SceneError, dumps, with_values
+from warpflag.scene import Scene, SceneError, with_values
 from warpflag.scene.scene_file import read_overrides
 
 __all__ = ["Outcome", "Run", "begun_at_checkpoint", "resume", "resume_batch", "start", "start_batch"]
@@ -54,8 +54,9 @@ def start(scene: Scene, output: str | None = None, device: str | None = None, **
     """
     simulation = Simulation(scene, device=device)
     directory, lock = claim_directory(scene.name, output)
-    write_whole(directory / SCENE_NAME, dumps(scene))
-    return Run(simulation, [Member(directory, scene, lock)], **options)
+    member = Member(directory, scene, lock)
+    write_whole(directory / SCENE_NAME, member.text)
+    return Run(simulation, [member], **options)
 
 
 def start_batch(
@@ -84,8 +85,8 @@ def start_batch(
         for scene, path in zip(scenes, directories, strict=True):
             directory, lock = claim_directory(scene.name, str(path))
             locks.append(lock)
-            write_whole(directory / SCENE_NAME, dumps(scene))
             members.append(Member(directory, scene, lock, alone=len(scenes) == 1))
+            write_whole(directory / SCENE_NAME, members[-1].text)
     except BaseException:
         for lock in locks:
             lock.release()
@@ -171,8 +172,8 @@ def _resumed(
         raise RunError(f"--resume {paths[0]}: some runs of the batch have a checkpoint and some have none")
     members = []
     for k, (path, scene, lock) in enumerate(zip(paths, scenes, locks, strict=True)):
-        write_whole(path / SCENE_NAME, dumps(scene))
         members.append(Member(path, scene, lock, metas[k] if metas else None, alone=len(paths) == 1))
+        write_whole(path / SCENE_NAME, members[-1].text)
     return Run(simulation, members, **options)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import itertools
 import re
@@ -88,15 +89,25 @@ def write_whole(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def settings_sha256(scene: Scene) -> str:
+def settings_sha256(scene: Scene, text: str | None = None) -> str:
     """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion.
 
     Only what differs from the defaults counts, so that a setting that a later version adds changes nothing.
+
+    Args:
+        scene: what is run.
+        text: the scene as TOML, where it is at hand.
     """
-    values, default = settings_of(scene), settings_of(Scene(name=scene.name))
+    values = settings_of(scene, text)
+    default = {**_default_settings(), "name": values["name"]}
     lines = [f"{key} = {value}" for key, value in values.items() if value != default.get(key, "none")]
     chosen = sorted(line for line in lines if line.partition(" ")[0] not in _NOT_OF_THE_MOTION)
     return hashlib.sha256("\n".join(chosen).encode()).hexdigest()
+
+
+@functools.cache
+def _default_settings() -> dict[str, str]:
+    return settings_of(Scene(name="default"))
 
 
 def is_of_scene(meta: Mapping[str, Any], scene: Scene, texts: Iterable[str]) -> bool:
@@ -176,11 +187,11 @@ def _difference(recorded: Scene, scene: Scene) -> str:
     return f"{key} = {new.get(key, 'none')}, recorded with {old.get(key, 'none')}"
 
 
-def settings_of(scene: Scene) -> dict[str, str]:
+def settings_of(scene: Scene, text: str | None = None) -> dict[str, str]:
     """All values of a scene as they are written, by dotted key; "none" where a value is absent."""
     settings: dict[str, str] = {}
     section, tables = "", 0
-    for line in dumps(scene).splitlines():
+    for line in (text or dumps(scene)).splitlines():
         if header := re.match(r"\[+([\w.]+)\]+", line):
             section = header[1]
             if line.startswith("[["):

@@ -12,6 +12,7 @@ from warpflag_kernels.stepping import accuracy
 from warpflag import observables
 from warpflag.observables.behaviour import of_record as behaviour
 from warpflag.record import Record
+from warpflag.record.layout import BODY_ORIENTATION, BODY_POSITION, MOTOR_ANGLE
 from warpflag.scene import Scene
 
 __all__ = ["accuracy_kept", "digest", "kept_words", "plain"]
@@ -20,16 +21,18 @@ SYNCHRONISED = 0.15
 """Phase difference below which two flagella count as synchronised."""
 
 
+_OBSERVABLES = "observables/"
 _NOTABLE = 2.0
 """A worst window is told where it is this many times the mean and what was asked."""
 
 
-def digest(record: Record, scene: Scene) -> dict[str, Any]:
+def digest(record: Record, scene: Scene, kept: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
     """Observables of the last frame, rates over the last third of the recorded time, and first times of two events.
 
     Args:
         record: with at least one frame.
         scene: of the record.
+        kept: its small entries by name, where they need not be read.
 
     Returns:
         `time` [s] and number of `frames`; `observables` by name; `rates`: `motor_rate` relative to the body and
@@ -38,12 +41,15 @@ def digest(record: Record, scene: Scene) -> dict[str, Any]:
         is `synchronised` and that is `zipped` [s], None where there is none; where the scene asks for it, `behaviour`
         (see `warpflag.observables.behaviour.of_record.digest`).
     """
-    times, measured = record.times, record.observables
+    entries = _read(record) if kept is None else kept
+    times = entries["time"]
+    names = sorted(name for name in entries if name.startswith(_OBSERVABLES))
+    measured = {name.removeprefix(_OBSERVABLES): entries[name] for name in names}
     found = {
         "time": float(times[-1]),
         "frames": len(times),
         "observables": {name: values[-1] for name, values in measured.items()},
-        "rates": _rates(record, scene, times, measured),
+        "rates": _rates(entries, scene, times, measured),
         "events": {
             "synchronised": _first(times, measured.get("phase_difference", np.ones(0)) < SYNCHRONISED),
             "zipped": _first(times, measured["bundle_length"] >= observables.ZIPPED),
@@ -101,12 +107,21 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _rates(record: Record, scene: Scene, times: np.ndarray, measured: dict[str, np.ndarray]) -> dict[str, Any] | None:
+def _read(record: Record) -> dict[str, np.ndarray]:
+    """The small entries of a record by name."""
+    observed = {f"{_OBSERVABLES}{name}": values for name, values in record.observables.items()}
+    own = {MOTOR_ANGLE: record.motor_angle, BODY_POSITION: record.body_position}
+    return {"time": record.times, BODY_ORIENTATION: record.body_orientation, **own, **observed}
+
+
+def _rates(
+    entries: Mapping[str, np.ndarray], scene: Scene, times: np.ndarray, measured: Mapping[str, np.ndarray]
+) -> dict[str, Any] | None:
     first = int(np.searchsorted(times, times[0] + 2 / 3 * (times[-1] - times[0]) - 1e-12))
     if len(times) - first < 2:
         return None
     window = times[first:]
-    angles, orientations = record.motor_angle[first:], record.body_orientation[first:]
+    angles, orientations = entries[MOTOR_ANGLE][first:], entries[BODY_ORIENTATION][first:]
     return {
         "from": window[0],
         "to": window[-1],
@@ -114,7 +129,7 @@ def _rates(record: Record, scene: Scene, times: np.ndarray, measured: dict[str, 
         "motor_rate_lab": observables.lab_motor_rate(window, angles, orientations, observables.motor_axes(scene)),
         # Each frame's rate is that of the interval before it, from the accumulated angle.
         "body_rate": np.average(measured["body_rate"][first + 1 :], weights=np.diff(window)),
-        "net_speed": observables.net_speed(window, record.body_position[first:]),
+        "net_speed": observables.net_speed(window, entries[BODY_POSITION][first:]),
     }
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import itertools
 import math
 import re
@@ -61,7 +62,7 @@ class Setting:
     pattern_text: str = "a text that is not empty"
     derived: str = ""
 
-    @property
+    @functools.cached_property
     def bounds(self) -> str:
         """The allowed values in short; empty for a switch."""
         span = f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
@@ -82,7 +83,7 @@ class Setting:
         }
         return words.get(self.kind, self.bounds)
 
-    @property
+    @functools.cached_property
     def explained(self) -> str:
         """Meaning, range, and what stands in for an absent value."""
         bounds = f" ({self.bounds})" if self.bounds else ""
