@@ -108,7 +108,7 @@ def main() -> None:
     for name, entry in ENTRIES.items():
         if name not in options.only:
             continue
-        directory = ran(name, entry.scene(), options.runs)
+        directory = ran(name, with_values(entry.scene(), {"name": name}), options.runs)
         render(directory, pictures / f"{name}.jpg", snapshots=3, size=(1200, 225))
         figures.save(figures.dashboard(directory), pictures / f"{name}-curves.png", dpi=110)
         text += [f"## {entry.title}\n", f"{entry.text}\n", f"![{entry.title}](gallery/{name}.jpg)\n"]
