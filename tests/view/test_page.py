@@ -199,7 +199,7 @@ def test_slider_moves_cell_and_curves(opened):
     assert left[1] < left[0] - 20  # it swims to the left
     opened.page.locator(".plot").first.click(position={"x": 1, "y": 10})
     assert opened.time == "0.00 ms"
-    np.testing.assert_array_equal(opened.picture(), first)
+    assert np.abs(opened.picture() - first).max() <= 1  # the browser rounds the background's gradient either way
 
 
 def test_following_keeps_the_cell_in_place(opened):
