@@ -29,7 +29,7 @@ from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, r
 from warpflag_kernels.stepping import dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
-from warpflag_kernels.thermal import additive_chart, equilibrium, strain_gradients
+from warpflag_kernels.thermal import additive_chart, equilibrium, mean_drift, strain_gradients
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import thermal_energy
@@ -106,6 +106,7 @@ class ThermalStepper:
             law = delassus.allocate(model, contacts)
             quasi_newton.allocate(model, contacts, law)
             self.flow = step_flow.allocate(model)
+            self.drift = mean_drift.allocate(model)
             self.stiffness = hessian.allocate(model)
             self._solved, self._product = chain_chart.allocate(model), chain_chart.allocate(model)
             self._magnitude = wp.zeros(len(contacts.gap), dtype=p.real, device=device)
@@ -133,9 +134,10 @@ class ThermalStepper:
         if model.timed:
             evaluation_time.within_step(state, s.control, self._data.one, model.device)
         reconstruction.reconstruct(model, state, s.chart)
-        noise.draw_local(model, state, s.control, self.noise)
+        noise.draw_local(model, state, s.control, self.noise, drifting=explicit)
         if explicit:
             self._draw_flows(in_single=False)
+            self._add_divergence()
             launch_right_hand_side(model, state)
         else:
             self._evaluate()
@@ -143,7 +145,10 @@ class ThermalStepper:
             linearised.factorise(model, state, self.stiffness, parts.band)
             if self.motors is not None:
                 motor_solve.prepare(model, state, parts.band, self.motors)
+            additive_chart.give_back(model, state, s.chart, self._work, s.control.step, self.noise)
         equilibrium.right_hand_side(model, state, parts, self.noise, self._x, explicit)
+        if not explicit:
+            self._remember_drift()
         x = self._x if explicit else self._solve()
         additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
         listed = parts.contacts if self._touching else None
@@ -184,8 +189,13 @@ class ThermalStepper:
         lanczos.draw_pairs(model, state, s.control, self.noise, self.lanczos, velocities)
         if around:
             body_noise.carry(model, state, self.noise, shell, pair)
-            body_noise.draw_probe(model, state, self.noise, s.control.steps)
-            body_noise.add_divergence(model, state, s.chart, self.noise)
+
+    def _add_divergence(self) -> None:
+        """The drift by the flow round the body, of a step that resolves all modes."""
+        s = self._system
+        if s.model.switches.flows.body:
+            body_noise.draw_probe(s.model, s.state, self.noise, s.control.steps)
+            body_noise.add_divergence(s.model, s.state, s.chart, self.noise)
 
     def _evaluate(self) -> None:
         """Thermal velocities, contacts, forces with the random elastic ones, and velocities, where the step starts."""
@@ -205,8 +215,17 @@ class ThermalStepper:
         if self._touching:
             equilibrium.random_contacts(model, state, parts, self.noise, share, self._magnitude)
             contact_list.act(model, state, parts.contacts, self._magnitude)
+        mean_drift.add_forces(model, state, self.drift)
         body.body_motion(model, state, self._terms)
+        mean_drift.add_velocities(model, state, self.drift, self.noise)
         node_velocity.node_velocities(model, state)
+
+    def _remember_drift(self) -> None:
+        s, shell = self._system, None
+        if s.model.switches.flows.body and step_flow.stores_pairs(s.model):
+            shell = self.flow.shell
+        space = lanczos.struct(s.model.precision)() if self.lanczos is None else self.lanczos.data
+        mean_drift.remember(s.model, s.state, s.control, self.noise, space, shell, self.drift)
 
     def _solve(self) -> Any:
         """The increment of the step, from the right side."""
@@ -236,10 +255,15 @@ class ThermalStepper:
         motor_solve.solve(model, state, self._data, parts.band, parts.law.gain, self.motors, none, none, x)
 
     def restart(self) -> None:
-        """A step knows nothing of those before it."""
+        self._work.owed.zero_()
+        if not self._explicit:
+            for name in mean_drift.MEMORY:
+                getattr(self.drift, name).zero_()
 
     def memory(self) -> dict[str, np.ndarray]:
-        kept = {"evaluations": self._system.control.steps.numpy().copy()}
+        kept = {"evaluations": self._system.control.steps.numpy().copy(), "owed": self._work.owed.numpy().copy()}
+        if not self._explicit:
+            kept |= {f"drift_{name}": getattr(self.drift, name).numpy().copy() for name in mean_drift.MEMORY}
         if self.lanczos is not None:
             kept["noise_products"] = self.lanczos.data.total.numpy().copy()
         if self.motors is not None:
@@ -248,6 +272,10 @@ class ThermalStepper:
         return kept
 
     def recall(self, memory: dict[str, np.ndarray]) -> None:
+        self._work.owed.assign(memory["owed"])
+        if not self._explicit:
+            for name in mean_drift.MEMORY:
+                getattr(self.drift, name).assign(memory[f"drift_{name}"])
         if self.lanczos is not None:
             self.lanczos.data.total.assign(memory["noise_products"])
         if self.motors is not None:

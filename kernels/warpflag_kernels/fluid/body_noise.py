@@ -100,6 +100,7 @@ def _kernels(p: Precision, pair: Precision) -> SimpleNamespace:
         e = wp.tid()
         if state.active[model.cell_of[e]] != 0 and e > model.first_node[model.flagellum_of[e]]:
             v = state.velocity[e]
+            noise.carried[e] = v
             noise.node[e] = noise.node[e] + vec4(v[0], v[1], v[2], zero)
 
     @wp.kernel(module=module)

@@ -41,6 +41,7 @@ def struct(p: Precision) -> Any:
         beta: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], beside it
         size: wp.array(dtype=wp.float64)  # [C], |z|
         weight: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], T^1/2 e_1 [(um/(s pN))^1/2]
+        inverse: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS], T^-1/2 e_1 [(pN s/um)^1/2]
         matrix: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS * MOST_PRODUCTS], work space
         vectors: wp.array(dtype=wp.float64)  # [C * MOST_PRODUCTS * MOST_PRODUCTS], eigenvectors of T
         tolerance: wp.array(dtype=wp.float64)  # [C], relative; 0: PRODUCTS products
@@ -80,6 +81,7 @@ def allocate(model: DeviceModel, tolerances: Sequence[float]) -> Process:
         ("alpha", MOST_PRODUCTS),
         ("beta", MOST_PRODUCTS),
         ("weight", MOST_PRODUCTS),
+        ("inverse", MOST_PRODUCTS),
         ("matrix", MOST_PRODUCTS**2),
         ("vectors", MOST_PRODUCTS**2),
     ):
@@ -135,7 +137,8 @@ def _root(p: Precision) -> Any:
 
     @wp.func(module=module)
     def root(z: Lanczos, c: wp.int32, n: wp.int32):
-        """Sets `weight` to T^1/2 e_1 after n products; returns the relative change since one product less."""
+        """Sets `weight` to T^1/2 e_1 and `inverse` to T^-1/2 e_1 after n products; returns the relative change of
+        the first since one product less."""
         zero = wp.float64(0.0)
         at = c * most * most
         for i in range(n):
@@ -155,9 +158,13 @@ def _root(p: Precision) -> Any:
         size = zero
         for i in range(n):
             value = zero
+            inverse = zero
             for j in range(n):
                 eigenvalue = wp.sqrt(wp.max(z.matrix[at + j * most + j], zero))
                 value += z.vectors[at + i * most + j] * eigenvalue * z.vectors[at + j]
+                if eigenvalue > zero:
+                    inverse += z.vectors[at + i * most + j] / eigenvalue * z.vectors[at + j]
+            z.inverse[c * most + i] = inverse
             before = zero
             if i + 1 < n:
                 before = z.weight[c * most + i]

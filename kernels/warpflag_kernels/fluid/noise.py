@@ -28,6 +28,8 @@ from warpflag_kernels.base import random_numbers
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
+ROUND_OFF = 1.0e-6  # of roots of a shell's mobility over the largest; below, the body is held in that direction
+
 
 @functools.cache
 def struct(p: Precision) -> Any:
@@ -42,6 +44,8 @@ def struct(p: Precision) -> Any:
         body: wp.array(dtype=vec6)  # [C] [um/s] and [rad/s]
         # Only with flow round the body.
         body_root: wp.array(dtype=real)  # [36 C], root of the shell's mobility in body axes, row after row
+        body_inverse: wp.array(dtype=real)  # [36 C], its inverse; zero in directions without a mobility
+        carried: wp.array(dtype=vec3)  # [E], what the random motion of the body does to nodes [um/s]
         probe: wp.array(dtype=vec3)  # [E], deviates W of nodes, by which the divergence is found
         probe_shift: wp.array(dtype=vec3)  # [C], of the body's motion
         probe_turn: wp.array(dtype=vec3)  # [C]
@@ -64,8 +68,13 @@ def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
     n.body = wp.zeros(model.cell_count, dtype=wp.types.vector(6, p.real), device=device)
     if model.switches.flows.body:
         values, vectors = np.linalg.eigh(model.data.body.shell_mobility.numpy().reshape(-1, 6, 6).astype(np.float64))
-        roots = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-        n.body_root = wp.array(roots.ravel(), dtype=p.real, device=device)
+        roots = np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        sound = roots > ROUND_OFF * roots.max(axis=2, keepdims=True)
+        inverses = np.where(sound, 1.0 / np.where(sound, roots, 1.0), 0.0)
+        turned = np.swapaxes(vectors, 1, 2)
+        n.body_root = wp.array(((vectors * roots) @ turned).ravel(), dtype=p.real, device=device)
+        n.body_inverse = wp.array(((vectors * inverses) @ turned).ravel(), dtype=p.real, device=device)
+        n.carried = wp.zeros(model.element_count, dtype=p.vec3, device=device)
         n.probe = wp.zeros(model.element_count, dtype=p.vec3, device=device)
         n.probe_shift, n.probe_turn = (wp.zeros(model.cell_count, dtype=p.vec3, device=device) for _ in range(2))
     return n
@@ -125,21 +134,33 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
         g = projector(mean) * bracket * (real(1.0) / total)
         return scale * (wp.trace(g) * mean + g * mean)
 
-    return SimpleNamespace(self_mobility=self_mobility, node_tangent=node_tangent, excess_root=excess_root, drift=drift)
+    @wp.func(module=module)
+    def axial_root(axis: vec3, along: real, across: real, xi: vec3):
+        """Root of an axially symmetric mobility on a vector."""
+        part = wp.dot(axis, xi) * axis
+        return wp.sqrt(along) * part + wp.sqrt(across) * (xi - part)
+
+    return SimpleNamespace(
+        self_mobility=self_mobility,
+        node_tangent=node_tangent,
+        excess_root=excess_root,
+        drift=drift,
+        axial_root=axial_root,
+    )
 
 
 @functools.cache
-def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamespace:
+def _kernels(p: Precision, pairs: bool, free: bool, shell: bool, drifting: bool) -> SimpleNamespace:
     real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
     Model, State, Noise = structs(p).Model, structs(p).State, struct(p)
     normals = random_numbers.functions(p).normals
     f = functions(p, pairs)
-    self_mobility, excess_root, drift = f.self_mobility, f.excess_root, f.drift
+    self_mobility, excess_root, drift, root = f.self_mobility, f.excess_root, f.drift, f.axial_root
     zero, two = wp.constant(real(0.0)), wp.constant(real(2.0))
     for_node, for_shift, for_turn = (
         wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
     )
-    names = "pairs" * pairs + "free" * free + "_shell" * shell
+    names = "pairs" * pairs + "free" * free + "_shell" * shell + "_drifting" * drifting
     module = p.module("noise", names)
 
     @wp.kernel(module=module)
@@ -167,14 +188,9 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
         v = vec3(real(0.0))
         if e > model.first_node[k]:
             v = scale * excess_root(model, state, e, k, c, vec3(xi[0], xi[1], xi[2]))
-            v += real(noise.energy[c]) * drift(model, state, e, k)
+            if wp.static(drifting):
+                v += real(noise.energy[c]) * drift(model, state, e, k)
         noise.node[e] = vec4(v[0], v[1], v[2], spin)
-
-    @wp.func(module=module)
-    def root(axis: vec3, along: real, across: real, xi: vec3):
-        """Root of an axially symmetric mobility on a vector."""
-        part = wp.dot(axis, xi) * axis
-        return wp.sqrt(along) * part + wp.sqrt(across) * (xi - part)
 
     @wp.kernel(module=module)
     def bodies(
@@ -213,7 +229,8 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
         if wp.static(free):
             first = model.first_node[model.first_flagellum[c]]
             axis = state.pose.tangent[first + 1]
-            v = (real(noise.energy[c]) * two * (across - along) / state.pose.length[first + 1]) * axis
+            if wp.static(drifting):
+                v = (real(noise.energy[c]) * two * (across - along) / state.pose.length[first + 1]) * axis
             own = self_mobility(model, c, model.first_flagellum[c])
             along = wp.max(along - own, zero)
             across = wp.max(across - own, zero)
@@ -224,16 +241,18 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
     return SimpleNamespace(elements=elements, bodies=bodies)
 
 
-def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any) -> None:
+def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any, drifting: bool = True) -> None:
     """Thermal velocities of the parts of the mobility that are local, and the drift, into `noise`.
 
     Args:
         model, state: of the batch.
         control: struct `Control`, with the step that begins and its number.
         noise: struct `Noise`.
+        drifting: whether with the drift, that of steps which resolve all modes.
     """
     switches = model.switches
-    kernels = _kernels(model.precision, switches.pairs != "none", switches.has("free end"), switches.flows.body)
+    pairs, free = switches.pairs != "none", switches.has("free end")
+    kernels = _kernels(model.precision, pairs, free, switches.flows.body, drifting)
     inputs = [model.data, state.data, control.step, control.steps, noise]
     wp.launch(kernels.elements, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.bodies, model.cell_count, inputs=inputs, device=model.device)

@@ -21,6 +21,7 @@ import warp as wp
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body as body_stage
+from warpflag_kernels.fluid import noise as noise_stage
 from warpflag_kernels.rod import chain_chart, rotations
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
@@ -41,6 +42,7 @@ def struct(p: Precision) -> Any:
         length: wp.array(dtype=real)  # [E], that the segment shall have [um]
         ratio: wp.array(dtype=real)  # [E], of the elimination along a flagellum
         tension: wp.array(dtype=real)  # [E], times the step [pN s]
+        owed: wp.array(dtype=real)  # [E], the sum of those of the last step, which the next one takes back [pN s]
         pull: wp.array(dtype=vec3)  # [K], on the anchor, times the step [pN s]
 
     return Additive
@@ -50,7 +52,7 @@ def allocate(model: DeviceModel) -> Any:
     """Arrays of the struct `Additive`, zero."""
     p, a = model.precision, struct(model.precision)()
     a.node = wp.zeros(model.element_count, dtype=p.vec3, device=model.device)
-    for name in ("length", "ratio", "tension"):
+    for name in ("length", "ratio", "tension", "owed"):
         setattr(a, name, wp.zeros(model.element_count, dtype=p.real, device=model.device))
     a.pull = wp.zeros(model.flagellum_count, dtype=p.vec3, device=model.device)
     return a
@@ -60,7 +62,8 @@ def allocate(model: DeviceModel) -> Any:
 def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
-    Increment, Additive = chain_chart.types(p).Increment, struct(p)
+    Increment, Additive, Noise = chain_chart.types(p).Increment, struct(p), noise_stage.struct(p)
+    vec6 = chain_chart.types(p).vec6
     f, fd = rotations.functions(p), rotations.functions(p.double)
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
@@ -115,6 +118,7 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
             b = x.body[c]
             before = vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), chart.base.position[first])
         a.node[e] = position + here
+        a.owed[e] = real(0.0)
         a.length[e] = wp.length(segment) + wp.dot(chart.base.tangent[e], here - before)
 
     @wp.func(module=module)
@@ -191,6 +195,7 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
         pushed = vec3(zero)  # by the segment after: -L t
         while e > first:
             tension = a.tension[e] - a.ratio[e] * later
+            a.owed[e] = a.owed[e] + tension
             own = tension * state.pose.tangent[e]
             a.node[e] = a.node[e] + respond_node(model, chart, e, k, own + pushed)
             pushed = -own
@@ -224,6 +229,44 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
         state.pose.body_position[c] = state.pose.body_position[c] + ud
         state.pose.body_orientation[c] = wp.normalize(rotation_vector_quatd(wd) * state.pose.body_orientation[c])
         chart.body_increment[c] = chart.body_increment[c] + vec6d(ud[0], ud[1], ud[2], wd[0], wd[1], wd[2])
+
+    @wp.kernel(module=module)
+    def give_back(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        a: Additive,
+        step: wp.array(dtype=wp.float64),
+        # Out:
+        noise: Noise,
+    ):
+        """Takes the last step's tensions back, as velocities of nodes and bodies."""
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        k = model.flagellum_of[e]
+        first = model.first_node[k]
+        if e > first:
+            force = -a.owed[e] * chart.base.tangent[e]
+            if e + 1 < model.first_node[k + 1]:
+                force += a.owed[e + 1] * chart.base.tangent[e + 1]
+            v = respond_node(model, chart, e, k, force) / real(step[c])
+            noise.node[e] = noise.node[e] + vec4(v[0], v[1], v[2], real(0.0))
+        elif k == model.first_flagellum[c]:
+            push = vec3(real(0.0))
+            torque = vec3(real(0.0))
+            while k < model.first_flagellum[c + 1]:
+                first = model.first_node[k]
+                one = a.owed[first + 1] * chart.base.tangent[first + 1]
+                push += one
+                torque += wp.cross(chart.base.position[first], one)
+                k += 1
+            u, w = respond(model, state, c, push, torque)
+            scale = real(1.0) / real(step[c])
+            noise.body[c] = noise.body[c] + scale * vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
     @wp.kernel(module=module)
     def frames(
@@ -283,8 +326,29 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
         chart.commit[c] = 1
 
     return SimpleNamespace(
-        move_bodies=move_bodies, displace=displace, restore=restore, pull_bodies=pull_bodies, frames=frames, tell=tell
+        move_bodies=move_bodies,
+        displace=displace,
+        restore=restore,
+        pull_bodies=pull_bodies,
+        give_back=give_back,
+        frames=frames,
+        tell=tell,
     )
+
+
+def give_back(model: DeviceModel, state: DeviceState, chart: Any, work: Any, step: Any, noise: Any) -> None:
+    """Adds to the thermal velocities of a step what the last one took away from displacements to restore lengths.
+
+    Args:
+        model, state: of the batch, at the start of the step.
+        chart: struct `Chart`, with the start.
+        work: struct `Additive`.
+        step: length of the step that begins [s], shape [cell_count].
+        noise: struct `Noise`, drawn.
+    """
+    kernel = _kernels(model.precision, model.switches.has("free end")).give_back
+    inputs = [model.data, state.data, chart, work, step, noise]
+    wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
 
 
 def retract(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: Any, restoring: bool = True) -> None:

@@ -8,11 +8,6 @@ of the strains, the stiffness that is left where no strain is loaded, and the fo
 fit together: f has the covariance kT H. An implicit step that solves with H and takes f along reproduces exp(-E/kT) for
 stiff modes too (`equilibrium`). H is positive whatever the load, and exact to first order in the step.
 
-**Lengths.** A step that restores lengths (`additive_chart`) leaves out that random displacements across a segment make
-it longer, on average at the rate kT tr[(1 - t t) D]/l, D the mobility of one end relative to the other. Without it the
-weight of a length l would not be l^2 exp(-E/kT). It is put back as the force along the segment that causes this rate,
-kT tr[(1 - t t) D]/(l t.D t), some kT/l or 0.02 pN, which the linear step then balances with the stretching stiffness.
-
 **Straight joints.** A filament that is straight at rest spins freely, by (2 kT dt/gamma_R L)^1/2 in a step or 0.23 rad
 in 1e-5 s at 1.2 um, and its bends, which do not follow, turn in the axes of its segments. Linearised, that turn
 lengthens them, and bending would be too warm by its square. So joints without rest curvature have no gradients of
@@ -106,8 +101,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
     Stiffness, Noise = hessian.struct(p), noise_stage.struct(p)
     f = functions(p)
     joint_gradients, joint_stiffness = f.joint_gradients, f.joint_stiffness
-    node_tangent = noise_stage.functions(p, False).node_tangent
-    one, two = wp.constant(real(1.0)), wp.constant(real(2.0))
     normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.STRAIN)
     module = p.module("strain_noise")
 
@@ -115,26 +108,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
     def without_joint(model: Model, i: wp.int32, k: wp.int32):
         """Whether there is nothing to join segment i and the next: at the tripod of a free filament."""
         return i == model.first_node[k] and model.rod.hook_rigidity[k] == real(0.0)
-
-    @wp.func(module=module)
-    def widening(model: Model, state: State, e: wp.int32, k: wp.int32):
-        """tr[(1 - t t) D]/(l t.D t) of segment e [1/um], by the local mobility of its nodes."""
-        t = state.pose.tangent[e]
-        first = model.first_node[k]
-        n = wp.dot(node_tangent(model, state, e, k), t)
-        excess = model.drag.mobility_along[e] - model.drag.mobility_across[e]
-        along = model.drag.mobility_across[e] + excess * n * n
-        across = two * model.drag.mobility_across[e] + excess * (one - n * n)
-        if e - 1 > first:
-            n = wp.dot(node_tangent(model, state, e - 1, k), t)
-            excess = model.drag.mobility_along[e - 1] - model.drag.mobility_across[e - 1]
-            along += model.drag.mobility_across[e - 1] + excess * n * n
-            across += two * model.drag.mobility_across[e - 1] + excess * (one - n * n)
-        elif model.rod.hook_rigidity[k] == real(0.0):  # r_0 is a free end
-            c = model.cell_of[e]
-            along += model.body.mobility_along[c]
-            across += two * model.body.mobility_across[c]
-        return across / (along * state.pose.length[e])
 
     @wp.kernel(module=module)
     def stiffnesses(
@@ -198,14 +171,13 @@ def _kernels(p: Precision) -> SimpleNamespace:
         s = joint_stiffness(model, i, k)
         m = scale * vec3(wp.sqrt(s[0]) * xi[0], wp.sqrt(s[1]) * xi[1], wp.sqrt(s[2]) * xi[2])
         tension = scale * wp.sqrt(model.rod.stretching_stiffness[k] / model.rod.segment_length[k])
-        energy = real(noise.energy[c])
         before = wp.transpose(on_e) * m
         after = wp.transpose(on_f) * m
         if i > model.first_node[k]:
-            before += (tension * xi[3] - energy * widening(model, state, i, k)) * state.pose.tangent[i]
+            before += tension * xi[3] * state.pose.tangent[i]
         if i + 1 == last:  # no joint begins with the last segment
             xi = normals(noise.seed[c], own + 1, steps[c], for_strain)
-            after += (tension * xi[3] - energy * widening(model, state, last, k)) * state.pose.tangent[last]
+            after += tension * xi[3] * state.pose.tangent[last]
         state.joint_before[i] = state.joint_before[i] + before
         state.joint_after[i] = state.joint_after[i] + after
         state.joint_spin_before[i] = state.joint_spin_before[i] + wp.dot(m, spin_e)
