@@ -1,13 +1,16 @@
 """The chart of thermal steps: nodes go where they are told, lengths become what they shall be, by forces in pairs."""
 
 import numpy as np
-from warpflag_kernels.rod import chain_chart
+import pytest
+from warpflag_kernels.fluid import noise
+from warpflag_kernels.rod import chain_chart, comoving_chart, free_end
 from warpflag_kernels.thermal import additive_chart
 
 from tests.helpers import anchors, attachment, cell, free_nodes, matrix, shaken, tangents
 from warpflag.run.simulation import Simulation
 
 TOLERANCE = {"float64": 1e-7, "float32": 3e-5}  # of a length [um]
+KT = 1.380649e-5 * 300.0
 BALANCE = {"float64": 5e-3, "float32": 3e-2}  # of forces, over their sum
 
 
@@ -64,3 +67,43 @@ def test_lengths_are_restored_by_forces_in_pairs(precision, device):
         rotation = matrix(pose.body_orientation.numpy()[0])
         assert np.allclose(pose.position.numpy()[e], rotation @ anchor, atol=1e-6)
         assert np.allclose(pose.tangent.numpy()[e], rotation @ motor, atol=1e-6)
+
+
+@pytest.mark.parametrize("body", [True, False])
+def test_the_next_step_takes_back_what_restored_the_lengths(body, precision, device):
+    """As velocities along the segments where they are then, by the local drag there, of nodes, body and free ends: over a
+    step of the same length, minus the displacements that the last one added."""
+    values = {"numerics.stepper": "implicit", "fluid.temperature": 300.0, "flagella.length": 1.2, "body.enabled": body}
+    scene = cell({**values, "flagella.count": 2 if body else 1}, precision)
+    sim = Simulation(scene, device=device, starts=shaken(scene, 4))
+    s, random, step = sim.system, np.random.default_rng(5), 1e-6
+    model, state = s.model, s.state
+    x, work, drawn = chain_chart.allocate(model), additive_chart.allocate(model), noise.allocate(model, [KT], [0])
+    nodes, motion = 0.003 * random.standard_normal((model.element_count, 4)), 0.001 * random.standard_normal((1, 6))
+    if not body:
+        motion[0, 3:] = 0.0
+    x.node.assign(nodes)
+    x.body.assign(motion)
+    sim.evaluate()
+    state.data.active.fill_(1)
+    s.control.step.fill_(step)
+    begun = pose(state) + state.data.pose.body_position.numpy()[0]
+    at = state.data.pose.body_position.numpy()[0].copy()
+    additive_chart.retract(model, state, s.chart, x, work)
+    ended, moving = pose(state) + state.data.pose.body_position.numpy()[0], free_nodes(scene)
+    beyond = (ended - begun - nodes[:, :3])[moving]
+    of_body = state.data.pose.body_position.numpy()[0] - at - motion[0, :3]
+    comoving_chart.commit(model, state, s.chart)
+    if not body:
+        free_end.align_axes(model, state)
+    additive_chart.give_back(model, state, s.chart, work, s.control.step, drawn)
+    back = step * drawn.node.numpy()[moving, :3].astype(np.float64)
+    assert abs(beyond).max() > 1e-5
+    assert abs(back + beyond).max() < 0.05 * abs(beyond).max()  # the drag turns with the segments
+    back = step * drawn.body.numpy()[0, :3].astype(np.float64)
+    assert abs(back + of_body).max() < 0.05 * max(abs(beyond).max(), abs(of_body).max())
+
+
+def pose(state):
+    """Nodes relative to the body's centre."""
+    return state.data.pose.position.numpy().astype(np.float64)

@@ -219,27 +219,3 @@ def test_random_elastic_force_has_the_covariance_of_the_stiffness(device):
     for direction in np.random.default_rng(1).standard_normal((20, len(moving))):
         variance = direction @ exact @ direction
         assert abs(np.var(found @ direction) / (KT * variance) - 1) < 3.5 * (2 / (count * draws)) ** 0.5
-
-
-def test_lengths_get_back_what_restoring_them_leaves_out(precision, device):
-    """kT tr[(1 - t t) D]/(l t.D t) along every segment, D from the dense local mobility; the anchor is at rest."""
-    scene = cell({"hydrodynamics.mode": "none", "flagella.count": 1, "flagella.length": 1.0, **WARM}, precision)
-    start = shaken(scene, 2)
-    draw = Draw([scene], [start], device)
-    elastic.joint_gradients(draw.model, draw.state)
-    state = draw.state.data
-    before, after = state.joint_before.numpy().copy(), state.joint_after.numpy().copy()
-    strain_gradients.add_random_moments(draw.model, draw.state, draw.stepper.noise, draw.control.steps, 0.0)
-    added = state.joint_before.numpy() - before
-    added[1:] += (state.joint_after.numpy() - after)[:-1]
-    nodes = start.positions[0]
-    segments = np.diff(nodes, axis=0)
-    mobility = dense_mobility(scene, start, 0.02)
-    for e, segment in enumerate(segments):
-        length = np.linalg.norm(segment)
-        t = segment / length
-        apart = sum(mobility[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in (e - 1, e) if i >= 0)
-        along = t @ apart @ t
-        exact = -KT * (np.trace(apart) - along) / (length * along) * t
-        size = abs(before).max() if precision == "float32" else abs(exact).max()  # what it is added to rounds
-        assert abs(added[e + 1] - exact).max() < 10 * TOLERANCE[precision] * max(size, abs(exact).max()) + 1e-12

@@ -3,7 +3,7 @@
 The matrix, inverse P, holds the local mobility; with the full one the equations are K x = b, K = D^-1 (1/dt + g M H).
 In stiff cells, where P K has eigenvalues far from 1 (`stability`), each of a step's two iterations solves P K x = P b
 in the Krylov space of P K and P b (Saad & Schultz, SIAM J. Sci. Stat. Comput. 7, 856 (1986)), `DIMENSION` products a
-solution. It does so after the contact solve, with the contact forces found there in b: forces balance as far as GMRES
+solution (more where there is noise: `thermal`). It does so after the contact solve, with the contact forces found there in b: forces balance as far as GMRES
 converges, and only the gaps are those that the matrix predicts, which the second iteration corrects.
 
 The inner product counts displacements in segment lengths, spins and the body's rotation in radians. A thread does a
@@ -33,10 +33,11 @@ def struct(p: Precision) -> Any:
 
     @wp.struct
     class Krylov:
-        node: wp.array(dtype=vec4)  # [(DIMENSION + 1) * E], basis, node parts
-        body: wp.array(dtype=vec6)  # [(DIMENSION + 1) * C], body parts
-        hessenberg: wp.array(dtype=wp.float64)  # [C * (DIMENSION + 2) * DIMENSION], column after column
-        right: wp.array(dtype=wp.float64)  # [C * (DIMENSION + 1)]
+        # n: the dimension of the space.
+        node: wp.array(dtype=vec4)  # [(n + 1) * E], basis, node parts
+        body: wp.array(dtype=vec6)  # [(n + 1) * C], body parts
+        hessenberg: wp.array(dtype=wp.float64)  # [C * (n + 2) * n], column after column
+        right: wp.array(dtype=wp.float64)  # [C * (n + 1)]
 
     return Krylov
 
@@ -47,20 +48,25 @@ class Space:
 
     Attributes:
         data: the struct `Krylov`.
-        basis: its vectors as structs `Increment`, which share their memory.
+        basis: its vectors as structs `Increment`, which share their memory; one more than the space has dimensions.
     """
 
     data: Any
     basis: list[Any]
 
+    @property
+    def dimension(self) -> int:
+        """Products of a solution."""
+        return len(self.basis) - 1
 
-def allocate(model: DeviceModel) -> Space:
-    """Room for the space, zero."""
+
+def allocate(model: DeviceModel, dimension: int = DIMENSION) -> Space:
+    """Room for a space of so many dimensions, zero."""
     p, device, cells, elements = model.precision, model.device, model.cell_count, model.element_count
-    t, k, count = chain_chart.types(p), struct(p)(), DIMENSION + 1
+    t, k, count = chain_chart.types(p), struct(p)(), dimension + 1
     k.node = wp.zeros(count * elements, dtype=p.vec4, device=device)
     k.body = wp.zeros(count * cells, dtype=t.vec6, device=device)
-    k.hessenberg = wp.zeros(cells * (DIMENSION + 2) * DIMENSION, dtype=wp.float64, device=device)
+    k.hessenberg = wp.zeros(cells * (dimension + 2) * dimension, dtype=wp.float64, device=device)
     k.right = wp.zeros(cells * count, dtype=wp.float64, device=device)
     basis = []
     for j in range(count):
@@ -71,11 +77,11 @@ def allocate(model: DeviceModel) -> Space:
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, size: int) -> SimpleNamespace:
     real, Model, State = p.real, structs(p).Model, structs(p).State
     Krylov, Stability, Increment = struct(p), stability_stage.struct(p), chain_chart.types(p).Increment
-    dimension = wp.constant(DIMENSION)
-    module = p.module("krylov")
+    dimension = wp.constant(size)
+    module = p.module("krylov", "" if size == DIMENSION else str(size))
 
     @wp.kernel(module=module)
     def mask(
@@ -172,7 +178,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         c = wp.tid()
         if state.active[c] == 0:
             return
-        for i in range(DIMENSION + 1):
+        for i in range(dimension + 1):
             krylov.right[c * (dimension + 1) + i] = wp.float64(0.0)
         krylov.right[c * (dimension + 1)] = normalised(model, krylov, c, 0, x)
 
@@ -293,10 +299,10 @@ def solve(
         work: increment to work in, struct `Increment`.
         x: struct `Increment`.
     """
-    kernels, device, cells = _kernels(model.precision), model.device, model.cell_count
+    kernels, device, cells = _kernels(model.precision, space.dimension), model.device, model.cell_count
     wp.launch(kernels.mask, cells, inputs=[stability, state.data], device=device)
     wp.launch(kernels.begin, cells, inputs=[model.data, state.data, x, space.data], device=device)
-    for j in range(DIMENSION):
+    for j in range(space.dimension):
         linearised.apply(model, state, stiffness, band, gain, space.basis[j], work)
         linearised.solve(model, state, band, work)
         wp.launch(kernels.orthogonalise, cells, inputs=[model.data, state.data, j, work, space.data], device=device)
