@@ -71,8 +71,8 @@ def test_lengths_are_restored_by_forces_in_pairs(precision, device):
 
 @pytest.mark.parametrize("body", [True, False])
 def test_the_next_step_takes_back_what_restored_the_lengths(body, precision, device):
-    """As velocities along the segments where they are then, by the local drag there, of nodes, body and free ends: over a
-    step of the same length, minus the displacements that the last one added."""
+    """As velocities along the segments where they are then, by the local drag there, of nodes, body and free ends: over
+    a step of the same length, minus the displacements that the last one added."""
     values = {"numerics.stepper": "implicit", "fluid.temperature": 300.0, "flagella.length": 1.2, "body.enabled": body}
     scene = cell({**values, "flagella.count": 2 if body else 1}, precision)
     sim = Simulation(scene, device=device, starts=shaken(scene, 4))

@@ -1,4 +1,4 @@
-"""The mean drift of an implicit step: the random force that goes with the thermal velocities, and what it does after."""
+"""The mean drift of an implicit step: the random force that goes with thermal velocities, and what it does after."""
 
 from __future__ import annotations
 
@@ -124,8 +124,8 @@ def test_g_of_a_free_filament(device):
 
 
 def test_filaments_that_only_the_flow_couples_are_where_chance_puts_them(device):
-    """Shares of least distances of two rods on hooks, without contact. With the divergence of the mobility of nodes alone
-    for the drift they are below 0.03 um in 29 instead of 19 of 100 cases."""
+    """Shares of least distances of two rods on hooks, without contact. With the divergence of the mobility of nodes
+    alone for the drift they are below 0.03 um in 29 instead of 19 of 100 cases."""
     apart, count = 0.045, 96
     beside = {"flagella.count": 2, "flagellum.0.azimuth": 0.0, "flagella.length": 0.6, "hydrodynamics.mode": "all"}
     beside["flagellum.1.azimuth"] = 2 * math.degrees(math.asin(apart / 0.8))

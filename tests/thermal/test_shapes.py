@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 
 from tests.oracles import segment_distances, steric_potential
 from tests.thermal.test_equilibrium import ERRORS, KT, ensemble
@@ -122,11 +123,13 @@ def weighed(a: np.ndarray, b: np.ndarray, boltzmann: bool) -> Any:
     return np.sum(weight * energy) / np.sum(weight), np.sum(weight * near) / np.sum(weight)
 
 
-def test_contact_has_its_boltzmann_factor(device):
+@pytest.mark.parametrize("mode", ["none", "all"])
+def test_contact_has_its_boltzmann_factor(mode, device):
     apart = 0.042
     beside = {"flagella.count": 2, "flagellum.0.azimuth": 0.0, "flagella.length": 0.6, "steric.enabled": True}
     beside["flagellum.1.azimuth"] = 2 * math.degrees(math.asin(apart / 0.8))
-    sim, _ = ensemble({**STRAIGHT, **HELD, **beside, "numerics.time_step": 5e-7}, "float64", 64, device)
+    values = {**STRAIGHT, **HELD, **beside, "hydrodynamics.mode": mode, "numerics.time_step": 1e-6}
+    sim, _ = ensemble(values, "float64", 64, device)
     sim.advance(2e-4)
     energies, shares = [], []
     for i in range(60):

@@ -1,12 +1,12 @@
 """Contacts of a step that is solved with the full mobility: the exact law at the gaps to which the whole step leads.
 
-Where a step begins, nearly parallel segments have their closest points anywhere, and thermal motion turns them by as much
-as a contact is wide: a force at the old points keeps other points no longer apart. So closest points, normals and gaps
-are found anew in the pose that the step leads to, and contact forces from there, on the increment without any.
+Where a step begins, nearly parallel segments have their closest points anywhere, and thermal motion turns them by as
+much as a contact is wide: a force at the old points keeps other points no longer apart. So closest points, normals and
+gaps are found anew in the pose that the step leads to, and contact forces from there, on the increment without any.
 
-The contact solve answers forces with P g M B, the matrix of the step for P. GMRES then solves with the full mobility, and
-the gaps move on, most where a contact is stiff over the step. So forces are found once more where that leads, on the
-increment less what they did, and GMRES solves for what their change does, in cells that have a contact.
+The contact solve answers forces with P g M B, the matrix of the step for P. GMRES then solves with the full mobility,
+and the gaps move on, most where a contact is stiff over the step. So forces are found once more where that leads, on
+the increment less what they did, and GMRES solves for what their change does, in cells that have a contact.
 """
 
 import functools

@@ -5,12 +5,12 @@ the mean drift that keeps exp(-E/kT) is then not kT div M, which holds where the
 
     A u,    u_i = kT sum_jk A_jk d_j M_ik.
 
-For the pair sum they differ much: its divergence is zero, but that of the mobility of filaments that keep their lengths
-is not, and without it two filaments that nothing but the flow couples would be near each other twice as often as they
-are in equilibrium, at any step in which a mode is stiff.
+For the pair sum they differ much: its divergence is zero, but that of the mobility of filaments that keep their
+lengths is not, and without it two filaments that nothing but the flow couples would be near each other twice as often
+as they are in equilibrium, at any step in which a mode is stiff.
 
-With g a random force that is correlated with the thermal velocities v as <v g^T> = kT/dt, the displacement has <x g^T> =
-A kT, so
+With g a random force that is correlated with the thermal velocities v as <v g^T> = kT/dt, the displacement has
+<x g^T> = A kT, so
 
     u = < [M(q + x) - M(q)] g >.
 
