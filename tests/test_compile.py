@@ -119,6 +119,7 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     reduced = set().union(*(launched(monkeypatch, precision, stepper, SWITCHES[name]) for stepper, name in VARIANTS))
     free = {"body.enabled": False, "flagella.count": 1, "fluid.temperature": 300.0}
     reduced |= launched(monkeypatch, precision, "implicit", free)
+    reduced |= launched(monkeypatch, precision, "euler", {**WARM, **SWITCHES["body flow"]})
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)

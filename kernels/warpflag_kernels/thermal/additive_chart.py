@@ -59,7 +59,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, free: bool) -> SimpleNamespace:
+def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     Increment, Additive, Noise = chain_chart.types(p).Increment, struct(p), noise_stage.struct(p)
@@ -68,7 +68,7 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
     respond = body_stage.mobility(p).respond
-    module = p.module("additive_chart", "free" if free else "")
+    module = p.module("additive_chart", "free" * free + "lawful" * lawful)
 
     @wp.kernel(module=module)
     def move_bodies(
@@ -300,11 +300,18 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
             t = (y - before) / length
         elif k == model.first_flagellum[c]:
             state.pose.body_axis[c] = body_axis(orientation)
+        spin = x.node[e][3]
         carried = transport(chart.base.director[e], chart.base.tangent[e], t)
+        if wp.static(lawful) and e == first and model.motor.prescribed[k] != 0:
+            # The tripod keeps to its rate against the body as it has turned in the end.
+            turned = orientation * wp.quat_inverse(chart.base.body_orientation[c])
+            carried = vec3(wp.quat_rotate(turned, wp.vec3d(chart.base.director[e])))
+            b = x.body[c]
+            spin -= wp.dot(chart.base.tangent[e], vec3(b[3], b[4], b[5]))
         state.pose.position[e] = y
         state.pose.tangent[e] = t
         state.pose.length[e] = length
-        state.pose.director[e] = perpendicular_unit(turn(carried, t, x.node[e][3]), t)
+        state.pose.director[e] = perpendicular_unit(turn(carried, t, spin), t)
 
     @wp.kernel(module=module)
     def tell(
@@ -336,6 +343,10 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     )
 
 
+def _kernels_of(model: DeviceModel) -> SimpleNamespace:
+    return _kernels(model.precision, model.switches.has("free end"), model.switches.has("motor law"))
+
+
 def give_back(model: DeviceModel, state: DeviceState, chart: Any, work: Any, step: Any, noise: Any) -> None:
     """Adds to the thermal velocities of a step what the last one took away from displacements to restore lengths.
 
@@ -346,7 +357,7 @@ def give_back(model: DeviceModel, state: DeviceState, chart: Any, work: Any, ste
         step: length of the step that begins [s], shape [cell_count].
         noise: struct `Noise`, drawn.
     """
-    kernel = _kernels(model.precision, model.switches.has("free end")).give_back
+    kernel = _kernels_of(model).give_back
     inputs = [model.data, state.data, chart, work, step, noise]
     wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
 
@@ -362,7 +373,7 @@ def retract(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: An
         restoring: whether lengths are restored.
     """
     free = model.switches.has("free end")
-    kernels, device, cells = _kernels(model.precision, free), model.device, model.cell_count
+    kernels, device, cells = _kernels_of(model), model.device, model.cell_count
     flagella, elements = model.flagellum_count, model.element_count
     wp.launch(kernels.move_bodies, cells, inputs=[model.data, x, state.data, chart], device=device)
     wp.launch(kernels.displace, elements, inputs=[model.data, state.data, chart, x, work], device=device)
