@@ -8,7 +8,7 @@ from typing import Any
 from unittest.mock import patch
 
 from warpflag_kernels.fluid import noise
-from warpflag_kernels.thermal import equilibrium, strain_gradients
+from warpflag_kernels.thermal import equilibrium, mean_drift, strain_gradients
 
 from .ensembles import ensemble
 from .joints import FLOW, HOOKED
@@ -34,9 +34,11 @@ def cost(share: float) -> None:
                     _, sim = ensemble({"flagella.count": 2, "steric.enabled": True, "body.contact": True,
                                        "numerics.time_step": 1e-6, **values}, 1)  # fmt: skip
                     if not noisy:
-                        stack.enter_context(patch.object(noise, "draw_local", lambda *_: None))
+                        stack.enter_context(patch.object(noise, "draw_local", lambda *_, **_k: None))
                         stack.enter_context(patch.object(strain_gradients, "add_random_moments", lambda *_: None))
                         stack.enter_context(patch.object(equilibrium, "random_contacts", _quiet_contacts))
+                        for step in ("add_forces", "add_velocities", "remember"):
+                            stack.enter_context(patch.object(mean_drift, step, lambda *_: None))
                         stack.enter_context(patch.object(sim.stepper, "_draw_flows", lambda **_: None))
                     sim.prepare()
                     sim.advance(1e-5)

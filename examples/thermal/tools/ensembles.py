@@ -10,6 +10,8 @@ import numpy as np
 
 from warpflag import Scene, Simulation, paper_scene, with_values
 
+from .starts import in_equilibrium
+
 KT = 1.380649e-5 * 300.0
 BASE = {
     "fluid.temperature": 300.0,
@@ -24,10 +26,15 @@ LOCKED = {"motor.law": "rate", "motor.rate": 0.0}  # motors that do not turn
 STRAIGHT = {"flagella.intrinsic_curvature": (0.0, 0.0, 0.0), "flagella.opening_angle": 0.0, "motor.axis_angle": 0.0}
 
 
-def ensemble(values: dict[str, Any], count: int) -> tuple[Scene, Simulation]:
-    """Cells that differ in their seeds, of the paper's model unless the values say otherwise."""
+def ensemble(values: dict[str, Any], count: int, sampled: bool = False) -> tuple[Scene, Simulation]:
+    """Cells that differ in their seeds, of the paper's model unless the values say otherwise.
+
+    sampled: whether they start in equilibrium; hooks that resist bending start unbent.
+    """
     scene = with_values(paper_scene("thermal"), {**BASE, **values})
-    return scene, Simulation([with_values(scene, {"fluid.seed": i}) for i in range(count)], device="cpu")
+    scenes, random = [with_values(scene, {"fluid.seed": i}) for i in range(count)], np.random.default_rng(0)
+    shapes = [in_equilibrium(scene, KT, random) for _ in scenes] if sampled else None
+    return scene, Simulation(scenes, device="cpu", starts=shapes)
 
 
 def looks(sim: Simulation, start: float, interval: float, count: int) -> Iterator[Any]:
