@@ -28,6 +28,7 @@ TABLES: dict[str, Callable[[float], None]] = {
         motion.body,
         motion.swimmer,
         shapes.tip,
+        shapes.neighbours,
         shapes.contact,
         cost.cost,
     )

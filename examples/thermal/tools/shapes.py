@@ -42,31 +42,42 @@ def tip(share: float) -> None:
         print(f"| {name} | {known:.4g} | {shown(value, error)} |", flush=True)
 
 
-def contact(share: float) -> None:
-    """Two straight filaments of 0.6 um, 0.045 um apart: least distance and contact energy, by exact sampling too."""
-    apart = 0.045
-    values = {
-        **STRAIGHT,
-        "flagella.count": 2,
-        "flagella.length": 0.6,
-        "flagellum.0.azimuth": 0.0,
-        "flagellum.1.azimuth": 2 * math.degrees(math.asin(apart / 0.8)),
-        "hook.stiffness": 4.0,
-        "steric.enabled": True,
-        "body.anchored": True,
-    }
-    edges, columns = (0.0, 0.040, 0.042, 0.044, 0.046), []
+APART = 0.045
+BESIDE = {
+    **STRAIGHT,
+    "flagella.count": 2,
+    "flagella.length": 0.6,
+    "flagellum.0.azimuth": 0.0,
+    "flagellum.1.azimuth": 2 * math.degrees(math.asin(APART / 0.8)),
+    "hook.stiffness": 4.0,
+    "body.anchored": True,
+}
+
+
+def _beside(share: float, touching: bool, edges: tuple[float, ...], runs: list[tuple[str, float, int, int]]) -> None:
+    """A table of mean contact energies and shares of least distances of two filaments; by exact sampling, too.
+
+    Args:
+        share: of the samples.
+        touching: whether they have contact.
+        edges: of the shares [um].
+        runs: mode, step [s], number of cells and of looks of every column.
+    """
+    values = {**BESIDE, "steric.enabled": touching}
     scene, _ = ensemble(values, 1)
-    parts = [exact.sampled_contact(scene, apart, 100_000, seed) for seed in range(10)]
-    for least, energy, weight in parts:
+    columns = []
+    for seed in range(20):
+        least, energy, weight = exact.sampled_contact(scene, APART, 100_000, seed)
+        if not touching:
+            weight = np.ones_like(weight)
         shares = [np.sum(weight[(least >= a) & (least < b)]) for a, b in pairwise(edges)]
-        columns.append(np.array([np.sum(weight * energy), *shares]) / np.sum(weight))
+        columns.append(np.array([np.sum(weight * energy * touching), *shares]) / np.sum(weight))
     told = {"exact": mean(np.array(columns))}
-    for step, frames in ((2e-7, 500), (1e-6, 1000), (5e-6, 1000)):
-        count, interval = 100, 5 * max(step, 1e-6)
-        _, sim = ensemble({**values, "numerics.time_step": step}, count)
+    diameter = 4 * scene.flagella.filament_radius
+    for mode, step, count, frames in runs:
+        _, sim = ensemble({**values, "numerics.time_step": step, "hydrodynamics.mode": mode}, count)
         found = []
-        for cells in looks(sim, 4e-4, interval, max(20, int(share * frames))):
+        for cells in looks(sim, 4e-4, max(5 * step, 5e-6), max(20, int(share * frames))):
             x = cells.positions.reshape(count, 2, 4, 3)
             least, energy = np.full(count, np.inf), np.zeros(count)
             for i in range(3):
@@ -75,10 +86,23 @@ def contact(share: float) -> None:
                     s, t = exact.closest_parameters(p, d, q, e)
                     distance = np.linalg.norm(p + s[:, None] * d - q - t[:, None] * e, axis=1)
                     least = np.minimum(least, distance)
-                    energy += exact.potential(distance, scene.steric.strength, 4 * scene.flagella.filament_radius) / KT
+                    if touching:
+                        energy += exact.potential(distance, scene.steric.strength, diameter) / KT
             found.append([energy, *((least >= a) & (least < b) for a, b in pairwise(edges))])
-        told[f"{step:g}"] = mean(np.array(found, float).mean(axis=0).T)
+        told[f"{mode}, {step:g}"] = mean(np.array(found, float).mean(axis=0).T)
     print("\n| | " + " | ".join(told) + " |\n|---|" + "---|" * len(told))
     names = ["contact energy [kT]", *(f"{a:.3f} to {b:.3f} µm" for a, b in pairwise(edges))]
     for i, name in enumerate(names):
-        print(f"| {name} | " + " | ".join(shown(v[i], e[i]) for v, e in told.values()) + " |", flush=True)
+        if touching or i:
+            print(f"| {name} | " + " | ".join(shown(v[i], e[i]) for v, e in told.values()) + " |", flush=True)
+
+
+def contact(share: float) -> None:
+    """Two straight filaments of 0.6 um, 0.045 um apart: least distance and contact energy."""
+    runs = [("none", 1e-6, 400, 600), ("all", 3e-7, 400, 400), ("all", 1e-6, 400, 800), ("all", 5e-6, 200, 1000)]
+    _beside(share, True, (0.0, 0.037, 0.038, 0.040, 0.042, 0.044), runs)
+
+
+def neighbours(share: float) -> None:
+    """The same two filaments without contact: nothing but the flow couples them."""
+    _beside(share, False, (0.0, 0.01, 0.02, 0.03, 0.04, 0.044), [("none", 1e-6, 400, 1600), ("all", 1e-6, 400, 1200)])
