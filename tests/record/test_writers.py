@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
+from warpflag.base.output import DiskError
 from warpflag.record import Record, RecordError, new_record
 from warpflag.record import recorder as recorder_module
 from warpflag.record.layout import E1, POSITION
@@ -231,6 +232,31 @@ def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written
         with Record(at_once.path) as record:
             assert_holds_frames(record, range(7 * k, 7 * k + count + 1))
     assert len(new_record._templates) == (2 if count == 1 else 4)  # two lengths of the text, all frames and one
+
+
+def test_a_short_record_that_is_committed_piece_by_piece_is_whole_each_time(tmp_path):
+    recorder = started(tmp_path / "run.h5", block_frames=6, keep_open=False)
+    for index in range(15):
+        recorder.write(frame(index))
+        if index in (0, 2, 7):
+            recorder.flush(sync=index > 0)
+            with Record(recorder.path) as record:
+                assert_holds_frames(record, range(index + 1))
+    inode = os.stat(recorder.path).st_ino
+    recorder.close()
+    assert os.stat(recorder.path).st_ino == inode  # no longer short
+    with Record(recorder.path) as record:
+        assert_holds_frames(record, range(15))
+    short = started(tmp_path / "short.h5", block_frames=6, keep_open=False)
+    short.write(frame(0))
+    short.flush()
+    short.write(frame(1))
+    content = short.path.read_bytes()
+    short.path.with_name("short.h5.tmp").symlink_to("/dev/full")
+    with pytest.raises(DiskError, match="No space"):
+        short.flush()
+    assert short.path.read_bytes() == content  # what was there stays
+    short.close()
 
 
 def test_what_is_small_is_kept_until_a_record_is_long_or_continued(tmp_path, monkeypatch):

@@ -73,6 +73,7 @@ class Recorder:
         self._block_frames, self._keep_open = block_frames, keep_open
         self._clock = clock
         self._started = False  # the file is there, open or not
+        self._first_rows: dict[str, NDArray[Any]] = {}  # all that is committed, while that is less than a block
         self._kept: dict[str, list[NDArray[Any]]] | None = {}
         self._file: Any = None
         self._disk: DiskFile | None = None
@@ -190,7 +191,7 @@ class Recorder:
         finally:
             if self._started:
                 self._resume_step = self._last_step  # started once more, it goes on
-            self._started = False
+            self._started, self._first_rows = False, {}
             self._release()
 
     def _commit(self) -> None:
@@ -205,8 +206,14 @@ class Recorder:
             rows[CHECKSUMS] = np.stack([checksums(rows[name]) for name in self._summed], axis=1)
         if not self._started:
             self._create(rows)
+            first = rows
+        elif self._first_rows and count <= self._block_frames:  # is written anew sooner than it is opened
+            first = {name: np.concatenate([self._first_rows[name], rows[name]]) for name in rows}
+            self._create(first)
         else:
             self._append(rows, count)
+            first = {}
+        self._first_rows = first if not self._keep_open and count < self._block_frames else {}
         self._keep(rows, count)
         self._committed, self._pending, self._last_commit = count, [], self._clock()
         if not self._keep_open:
@@ -283,12 +290,13 @@ class Recorder:
         """Makes the file with its first frames, in memory and then under a temporary name: it is never there in part.
 
         Raises:
-            RecordError: the file exists.
-            DiskError: it could not be written; there is none then.
+            RecordError: the file exists, and this recorder has not made it.
+            DiskError: it could not be written; there is none then, or the one before.
         """
         pending, shapes = self._pending, self._shapes
         self._pending, self._shapes = [], {}  # nothing is kept of frames that can't be written
-        self._refuse_existing()
+        if not self._started:
+            self._refuse_existing()
         image = first_image(rows, self._parameters)
         temporary = self.path.with_name(self.path.name + ".tmp")
         try:
