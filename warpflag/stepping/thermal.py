@@ -46,7 +46,7 @@ RENEWALS = 1
 """How often closest points are found anew where the step leads, before the full mobility is solved with; two change
 nothing beyond 1 %, none leaves contact energies of parallel filaments 30 % too large at 1e-6 s."""
 PRODUCTS = 8
-"""Of GMRES: at 1e-5 s six leave the bends of two filaments of 6 um 0.05 um apart 0.6 % colder than twelve, eight 0.2 %."""
+"""Of GMRES: at 1e-5 s six leave the bends of two filaments 0.05 um apart 0.6 % colder than twelve, eight 0.2 %."""
 
 
 def thermal_step(scene: Scene) -> float:
