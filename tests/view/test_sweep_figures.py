@@ -54,7 +54,7 @@ def test_curves_show_means_and_standard_errors_of_the_repeats(line):
     assert (speed.get_xlabel(), speed.get_ylabel()) == ("motor torque [pN µm]", "net speed [µm/s]")
     points = zipped.containers[0][0].get_xydata()
     np.testing.assert_allclose(points[:2], [[1.0, 5.0], [2.0, 3.0]])  # ms
-    assert np.isnan(points[2, 1]) and zipped.get_ylabel() == "zipped [ms]"
+    assert np.isnan(points[2, 1]) and zipped.get_ylabel() == "time to zip [ms]"
 
 
 def test_a_second_axis_makes_a_line_each(grid):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,27 +13,15 @@ from warpflag.scene import scene_file
 from warpflag.scene.errors import Problems, SceneError, shown, written
 from warpflag.scene.formats import BEFORE_FORMATS
 from warpflag.scene.scene import Scene
-from warpflag.scene.sections import (
-    Body,
-    External,
-    Flagella,
-    FlagellumOverride,
-    Fluid,
-    Hook,
-    Hydrodynamics,
-    Motor,
-    Numerics,
-    Polymorphs,
-    Start,
-    Steric,
-)
+from warpflag.scene.sections import Flagella, FlagellumOverride
 from warpflag.scene.settings import Section, Setting
 
 __all__ = ["check_key", "dumps", "flagellum_example", "load", "loads", "with_values"]
 
 _SECTIONS: dict[str, type[Section]] = {
-    cls.key: cls
-    for cls in (Flagella, Motor, Hook, Polymorphs, Fluid, Hydrodynamics, Steric, Body, External, Numerics, Start)
+    own.name: own.default_factory
+    for own in dataclasses.fields(Scene)
+    if isinstance(own.default_factory, type) and issubclass(own.default_factory, Section)
 }
 _KEYS: dict[str, Setting] = {
     f"{cls.key}.{name}".lstrip("."): setting

@@ -302,10 +302,15 @@ def _leaf(name: str) -> str:
     return parts[-1]
 
 
+_WORDS = {"motor_rate_lab": "motor rate in the lab", "zipped": "time to zip", "synchronised": "time to synchronise"}
+
+
 def _label(name: str) -> str:
     """The name of a column in words, with its unit."""
     words = " ".join(
-        part.replace("_", " ") for part in name.split(".") if part not in ("rates", "observables", "events")
+        _WORDS.get(part, part.replace("_", " "))
+        for part in name.split(".")
+        if part not in ("rates", "observables", "events")
     )
     unit = _UNITS.get(_leaf(name), ("", 1.0))[0]
     return f"{words} [{unit}]" if unit else words

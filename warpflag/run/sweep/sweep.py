@@ -177,7 +177,8 @@ class SweepRun:
         kind = "cuda" if pool.devices[0].startswith("cuda") else "cpu"
         size, seconds = best_size(len(pending), workers, alone, together, len(group), _LARGEST_BATCH[kind])
         if not quiet:
-            which = f"batches of {size}" if size > 1 else "one by one"
+            idle = ", since batches would leave workers idle" if together < alone else ""
+            which = f"batches of {size}" if size > 1 else f"one by one{idle}"
             tell(
                 f"{len(pending)} members on {workers} worker{'s' if workers > 1 else ''} "
                 f"({', '.join(dict.fromkeys(pool.devices))}), {which}, about {seconds:.2g} s: a member takes "
