@@ -20,6 +20,7 @@ from warpflag.scene import SceneError
 
 STEPPERS = {
     "rkc": {"numerics.stepper": "rkc"},
+    "rkc, fixed steps": {"numerics.stepper": "rkc", "numerics.time_step": 1e-6},
     "euler": {"numerics.stepper": "euler", "duration": 4e-7},
     "implicit": {"numerics.stepper": "implicit"},
     "float32": {"numerics.precision": "float32"},
@@ -35,8 +36,9 @@ def test_a_restored_simulation_goes_on_with_the_same_bits(values, device):
         for index, frame in enumerate(one.frames(scene.duration)):
             frames.append(frame)
             kept[index] = one.checkpoint()
-    for index in (0, 3, 7):
-        other = Simulation(scene, device=device)
+    # New simulations, and one that has gone on.
+    for index, other in ((0, None), (3, None), (3, one), (7, one)):
+        other = other or Simulation(scene, device=device)
         other.restore(kept[index])
         rest = list(other.frames(scene.duration))
         assert len(rest) == 8 - index

@@ -329,6 +329,7 @@ class Simulation:
         self.stepper.restart()
         self.stepper.recall(parts["stepper"])
         self._frames.recall(parts["frame"])
+        self.system.control.step.zero_()  # the last step taken here did not lead to the restored state
         self._reconstruct()
         self.system.state.data.active.zero_()
 
