@@ -11,7 +11,7 @@ import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.base.types import DeviceModel
 from warpflag_kernels.contact import contact_list, search
-from warpflag_kernels.fluid import body, node_velocity
+from warpflag_kernels.fluid import node_velocity
 from warpflag_kernels.implicit import (
     block_band,
     collocation,
@@ -25,9 +25,10 @@ from warpflag_kernels.implicit import (
     step_flow,
 )
 from warpflag_kernels.motor import hook
-from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, polymorphs
+from warpflag_kernels.rod import chain_chart, comoving_chart, hessian, polymorphs
 from warpflag_kernels.stepping import balance, dense_output, evaluation_time, health
 from warpflag_kernels.stepping.frame_slots import DenseOutput
+from warpflag_kernels.stepping.right_hand_side import launch_with_contacts
 
 from warpflag.scene import Scene
 from warpflag.stepping.stepper import System, allocated_control, recalled, restart_step_control, step_memory
@@ -110,7 +111,6 @@ class ImplicitStepper:
         self._system = system
         model = system.model
         self._terms = tuple(term.within_step or term for term in model.terms)
-        self._smooth_terms = tuple(term for term in self._terms if not term.contact)
         self._touching = model.touching
         self.history, self._moved_history = History.allocate(model), History.allocate(model)
         self._scratch = Scratch.allocate(model)
@@ -199,13 +199,8 @@ class ImplicitStepper:
     def _evaluate(self, in_single: bool = False) -> None:
         """Velocities at the present pose, with the contact forces found so far."""
         model, state = self._system.model, self._system.state
-        for term in self._smooth_terms:
-            if term.launch is not None:
-                term.launch(model, state)
-        forces.total_forces(model, state, self._smooth_terms)
-        if self._touching:
-            contact_list.act(model, state, self.contacts, self.law.force)
-        body.body_motion(model, state, self._terms, single=self.flow.shell if in_single else None)
+        shell = self.flow.shell if in_single else None
+        launch_with_contacts(model, state, self._terms, self.contacts, self.law.force, shell)
         if in_single:
             step_flow.single_velocities(model, state, self.flow)
         else:

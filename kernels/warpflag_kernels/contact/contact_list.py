@@ -161,10 +161,35 @@ def functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
+def acting(p: Precision, body: bool) -> Any:
+    """Device function: what `act` does, for one cell by one thread; with contact with the body, or without."""
+    real, vec3, node_loads = p.real, p.vec3, functions(p).node_loads
+    Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
+
+    @wp.func(module=p.module("contacts", "cells_body" if body else "cells"))
+    def act_on_cell(model: Model, contacts_in: Contacts, magnitude: wp.array(dtype=real), state: State, c: wp.int32):
+        node_loads(model, contacts_in, magnitude, c, state.force)
+        if wp.static(body):
+            e = model.first_node[model.first_flagellum[c]]
+            while e < model.first_node[model.first_flagellum[c + 1]]:
+                state.body_contact[e] = vec3(real(0.0))
+                e += 1
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                i = contacts_in.body_head[k]
+                while i >= 0:
+                    state.body_contact[contacts_in.segment[i]] = magnitude[i] * contacts_in.normal[i]
+                    i = contacts_in.next[i]
+                k += 1
+
+    return act_on_cell
+
+
+@functools.cache
 def _kernels(p: Precision, body: bool) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Contacts = structs(p).Model, structs(p).State, struct(p)
-    segment_loads, node_loads = functions(p).segment_loads, functions(p).node_loads
+    segment_loads, act_on_cell = functions(p).segment_loads, acting(p, body)
 
     @wp.kernel(module=p.module("contacts", "body" if body else ""))
     def act(
@@ -202,21 +227,8 @@ def _kernels(p: Precision, body: bool) -> SimpleNamespace:
         state: State,
     ):
         c = wp.tid()
-        if state.active[c] == 0:
-            return
-        node_loads(model, contacts, magnitude, c, state.force)
-        if wp.static(body):
-            e = model.first_node[model.first_flagellum[c]]
-            while e < model.first_node[model.first_flagellum[c + 1]]:
-                state.body_contact[e] = vec3(real(0.0))
-                e += 1
-            k = model.first_flagellum[c]
-            while k < model.first_flagellum[c + 1]:
-                i = contacts.body_head[k]
-                while i >= 0:
-                    state.body_contact[contacts.segment[i]] = magnitude[i] * contacts.normal[i]
-                    i = contacts.next[i]
-                k += 1
+        if state.active[c] != 0:
+            act_on_cell(model, contacts, magnitude, state, c)
 
     return SimpleNamespace(act=act, act_on_cells=act_on_cells)
 

@@ -85,7 +85,7 @@ def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace
     Increment, body_rate = chain_chart.types(p).Increment, functions(p, shell).body_rate
     inverse6 = functions(p, shell).inverse6
     solve_column, solve_columns = cholesky.functions(p).solve_column, block_band_simd.functions(p).columns
-    follow = block_band.functions(p).follow
+    follow, solve_cell = block_band.functions(p).follow, block_band.functions(p).solve_cell
     module = p.module("body_coupling", "_".join([*["bearing"] * bearing_torque, *["shell"] * shell]))
 
     @wp.kernel(module=module)
@@ -243,6 +243,19 @@ def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace
             b += 1
         band.body_inverse[c] = inverse6(system)
 
+    @wp.func(module=module)
+    def solve_body(model: Model, state: State, band: Band, c: wp.int32, x: Increment):
+        """Motion of the body of cell c from the solutions with the body at rest, in place of its velocities."""
+        back = vec6(real(0.0))
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            e = model.first_node[k]
+            for j in range(3):
+                back += wp.transpose(band.from_body[3 * k + j]) * x.node[e + j]
+            k += 1
+        rate = x.body[c] - real(band.weight[c]) * body_rate(model, state, c, back)
+        x.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
+
     @wp.kernel(module=module)
     def solve_bodies(
         # Model:
@@ -254,17 +267,8 @@ def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace
         x: Increment,
     ):
         c = wp.tid()
-        if state.active[c] == 0:
-            return
-        back = vec6(real(0.0))
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            e = model.first_node[k]
-            for j in range(3):
-                back += wp.transpose(band.from_body[3 * k + j]) * x.node[e + j]
-            k += 1
-        rate = x.body[c] - real(band.weight[c]) * body_rate(model, state, c, back)
-        x.body[c] = real(band.step[c]) * (band.body_inverse[c] * rate)
+        if state.active[c] != 0:
+            solve_body(model, state, band, c, x)
 
     @wp.kernel(module=module)
     def follow_bodies(
@@ -281,6 +285,27 @@ def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace
         if state.active[c] != 0:
             x.node[e] = follow(band, e, x.node[e], x.body[c])
 
+    @wp.kernel(module=module)
+    def solve_cells(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        band: Band,  # its work space
+        x: Increment,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        solve_cell(model, band, c, x)
+        solve_body(model, state, band, c, x)
+        moved = x.body[c]
+        e = model.first_node[model.first_flagellum[c]]
+        while e < model.first_node[model.first_flagellum[c + 1]]:
+            x.node[e] = follow(band, e, x.node[e], moved)
+            e += 1
+
     return SimpleNamespace(
         couple_body=couple_body,
         body_columns=body_columns,
@@ -288,6 +313,7 @@ def _kernels(p: Precision, bearing_torque: bool, shell: bool) -> SimpleNamespace
         factorise_bodies=factorise_bodies,
         solve_bodies=solve_bodies,
         follow_bodies=follow_bodies,
+        solve_cells=solve_cells,
     )
 
 
@@ -312,7 +338,11 @@ def factorise(model: DeviceModel, state: DeviceState, band: Any) -> None:
 
 
 def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
-    """Motion of the bodies from the solutions with the bodies at rest, and the flagella's share in it; in place."""
+    """Flagella and bodies together: from right-hand sides to the solution, in place."""
     kernels, inputs = _kernels_of(model), [model.data, state.data, band, x]
+    if model.plan.by_cells and model.plan.chains == "simd":
+        wp.launch(kernels.solve_cells, model.cell_count, inputs=inputs, device=model.device)
+        return
+    block_band.solve(model, state, band, x)
     wp.launch(kernels.solve_bodies, model.cell_count, inputs=inputs, device=model.device)
     wp.launch(kernels.follow_bodies, model.element_count, inputs=inputs, device=model.device)

@@ -123,5 +123,4 @@ def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any)
 
 def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
     """From D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place of them."""
-    block_band.solve(model, state, band, x)
     body_coupling.solve(model, state, band, x)

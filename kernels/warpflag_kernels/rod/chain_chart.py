@@ -61,10 +61,18 @@ def _kernels(p: Precision, transporting: bool) -> SimpleNamespace:
         """Increment of a point y of the body."""
         return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), y)
 
+    @wp.func(module=module)
+    def retract_body(start: Pose, s: wp.float64, x: Increment, c: wp.int32, end: Pose):
+        b = x.body[c]
+        u = s * wp.vec3d(wp.float64(b[0]), wp.float64(b[1]), wp.float64(b[2]))
+        w = s * wp.vec3d(wp.float64(b[3]), wp.float64(b[4]), wp.float64(b[5]))
+        orientation = wp.normalize(rotation_vector_quatd(w) * start.body_orientation[c])
+        end.body_position[c] = start.body_position[c] + u
+        end.body_orientation[c] = orientation
+        end.body_axis[c] = body_axis(orientation)
+
     @wp.kernel(module=module)
     def retract_bodies(
-        # Model:
-        model: Model,
         # State:
         state: State,
         start: Pose,
@@ -74,16 +82,8 @@ def _kernels(p: Precision, transporting: bool) -> SimpleNamespace:
         end: Pose,
     ):
         c = wp.tid()
-        if state.active[c] == 0:
-            return
-        b = x.body[c]
-        s = scale[c]
-        u = s * wp.vec3d(wp.float64(b[0]), wp.float64(b[1]), wp.float64(b[2]))
-        w = s * wp.vec3d(wp.float64(b[3]), wp.float64(b[4]), wp.float64(b[5]))
-        orientation = wp.normalize(rotation_vector_quatd(w) * start.body_orientation[c])
-        end.body_position[c] = start.body_position[c] + u
-        end.body_orientation[c] = orientation
-        end.body_axis[c] = body_axis(orientation)
+        if state.active[c] != 0:
+            retract_body(start, scale[c], x, c, end)
 
     @wp.func(module=module)
     def retract_tripod(model: Model, start: Pose, s: real, x: Increment, k: wp.int32, c: wp.int32, end: Pose):
@@ -167,8 +167,25 @@ def _kernels(p: Precision, transporting: bool) -> SimpleNamespace:
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
 
+    @wp.func(module=module)
+    def retract_group(
+        groups: Groups, g: wp.int32, model: Model, start: Pose, s: real, x: Increment, a: Increment, b: Increment,
+        c: wp.int32, end: Pose, a_out: Increment, b_out: Increment,
+    ):  # fmt: skip
+        """Group g of cell c: flagella in the lanes of a vector register."""
+        chain_rows(groups, g, model.first_node, c, model, start, s, x, a, b, end, a_out, b_out)
+        k = groups.first[g]
+        k_end = k + groups.count[g]
+        while k < k_end:
+            retract_tripod(model, start, s, x, k, c, end)
+            if wp.static(transporting):
+                first = model.first_node[k]
+                a_out.node[first] = a.node[first]
+                b_out.node[first] = b.node[first]
+            k += 1
+
     @wp.kernel(module=module)
-    def retract_groups(
+    def retract_cells(
         # Model:
         groups: Groups,
         model: Model,
@@ -184,27 +201,20 @@ def _kernels(p: Precision, transporting: bool) -> SimpleNamespace:
         a_out: Increment,
         b_out: Increment,
     ):
-        g = wp.tid()
-        k = groups.first[g]
-        c = model.cell_of[model.first_node[k]]
+        c = wp.tid()
         if state.active[c] == 0:
             return
-        s = real(scale[c])
-        chain_rows(groups, g, model.first_node, c, model, start, s, x, a, b, end, a_out, b_out)
-        k_end = k + groups.count[g]
-        if wp.static(transporting) and k == model.first_flagellum[c]:
+        retract_body(start, scale[c], x, c, end)
+        g = groups.first_group[c]
+        while g < groups.first_group[c + 1]:
+            retract_group(groups, g, model, start, real(scale[c]), x, a, b, c, end, a_out, b_out)
+            g += 1
+        if wp.static(transporting):
             a_out.body[c] = a.body[c]
             b_out.body[c] = b.body[c]
-        while k < k_end:
-            retract_tripod(model, start, s, x, k, c, end)
-            if wp.static(transporting):
-                first = model.first_node[k]
-                a_out.node[first] = a.node[first]
-                b_out.node[first] = b.node[first]
-            k += 1
 
     return SimpleNamespace(
-        retract_bodies=retract_bodies, retract_flagella=retract_flagella, retract_groups=retract_groups
+        retract_bodies=retract_bodies, retract_flagella=retract_flagella, retract_cells=retract_cells
     )
 
 
@@ -229,11 +239,10 @@ def retract(
     """
     kernels = _kernels(model.precision, transported is not None)
     a, b, a_out, b_out = transported or (x, x, x, x)
-    inputs = [model.data, state.data, start, scale, x, end]
-    wp.launch(kernels.retract_bodies, model.cell_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, start, scale, x, a, b, end, a_out, b_out]
     if model.plan.chains == "simd":
-        groups = model.groups
-        wp.launch(kernels.retract_groups, len(groups.first), inputs=[groups, *inputs], device=model.device)
-    else:
-        wp.launch(kernels.retract_flagella, model.flagellum_count, inputs=inputs, device=model.device)
+        wp.launch(kernels.retract_cells, model.cell_count, inputs=[model.groups, *inputs], device=model.device)
+        return
+    bodies = [state.data, start, scale, x, end]
+    wp.launch(kernels.retract_bodies, model.cell_count, inputs=bodies, device=model.device)
+    wp.launch(kernels.retract_flagella, model.flagellum_count, inputs=inputs, device=model.device)

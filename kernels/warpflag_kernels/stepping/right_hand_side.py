@@ -3,6 +3,8 @@
 Stage by stage, a launch or more for each, or a whole cell in one launch by one thread: a CPU works through the threads
 of a launch one after the other, and every launch costs it what some ten nodes do. Both call the same device functions
 in the same order, so the numbers are the same.
+
+An implicit step gives the contact forces instead of having them evaluated (`launch_with_contacts`).
 """
 
 import functools
@@ -15,7 +17,7 @@ from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.contact import neighbours
+from warpflag_kernels.contact import contact_list, neighbours
 from warpflag_kernels.fluid import body, body_flow, node_velocity, rotne_prager
 from warpflag_kernels.fluid import shell as shell_stage
 from warpflag_kernels.rod import forces
@@ -111,6 +113,78 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: F
             carry(model, state, shell, c)
 
     return right_hand_side
+
+
+@functools.cache
+def _with_contacts(
+    p: Precision, smooth: tuple[Term, ...], terms: tuple[Term, ...], touching: bool, body_contact: bool
+) -> Any:
+    Model, State, Contacts = structs(p).Model, structs(p).State, contact_list.struct(p)
+    evaluate_flagellum, act_on_cell = _evaluators(p, smooth)[1], contact_list.acting(p, body_contact)
+    gather, motion = forces.functions(p, smooth).gather, body.functions(p, terms, False)
+    sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
+    settles = settle is not None
+
+    @wp.kernel(module=p.module("whole_cell", variant(terms) + "_contacts" * touching))
+    def with_contacts(
+        # Model:
+        model: Model,
+        # State:
+        contacts: Contacts,
+        magnitude: wp.array(dtype=p.real),
+        # Out:
+        state: State,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            evaluate_flagellum(model, state, k, c)
+            e = model.first_node[k]
+            while e < model.first_node[k + 1]:
+                gather(model, state, e, k)
+                e += 1
+            k += 1
+        if wp.static(touching):
+            act_on_cell(model, contacts, magnitude, state, c)
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            sum_flagellum(model, state, k)
+            k += 1
+        if wp.static(settles):
+            settle(model, state, c)
+        move(model, state, c)
+
+    return with_contacts
+
+
+def launch_with_contacts(
+    model: DeviceModel, state: DeviceState, terms: tuple[Term, ...], contacts: Any, magnitude: wp.array, single: Any
+) -> None:
+    """Forces, torques and the motion of the bodies at the pose of `state`, where the contact forces are given.
+
+    Args:
+        model, state: of the batch.
+        terms: those that count; of contacts only what they put on the body.
+        contacts: the listed contacts, struct `Contacts`.
+        magnitude: their forces [pN].
+        single: as in `body.body_motion`.
+    """
+    smooth = tuple(term for term in terms if not term.contact)
+    in_one = model.plan.by_cells and not combined(model.precision, smooth).in_cell and not model.switches.flows.body
+    if in_one:
+        kernel = _with_contacts(model.precision, smooth, terms, model.touching, model.switches.has("body contact"))
+        inputs = [model.data, contacts, magnitude, state.data]
+        wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
+        return
+    for term in smooth:
+        if term.launch is not None:
+            term.launch(model, state)
+    forces.total_forces(model, state, smooth)
+    if model.touching:
+        contact_list.act(model, state, contacts, magnitude)
+    body.body_motion(model, state, terms, single=single)
 
 
 def stages(model: DeviceModel) -> list[tuple[str, Callable[[DeviceModel, DeviceState], None]]]:
