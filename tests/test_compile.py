@@ -123,6 +123,7 @@ def test_every_kernel_compiles_for_cuda(precision, monkeypatch, tmp_path):
     once = without_precision()
     on_cpu = set().union(*(launched(monkeypatch, precision, stepper, {}, by_cells=True) for stepper in STEPPERS))
     on_cpu |= launched(monkeypatch, precision, "implicit", CROWD, by_cells=True)
+    on_cpu |= launched(monkeypatch, precision, "implicit", lawful, by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "implicit", {**WARM, **SWITCHES["body flow"]}, by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "implicit", SWITCHES["body flow"], by_cells=True)
     on_cpu |= launched(monkeypatch, precision, "rkc", SWITCHES["body flow"], by_cells=True)
