@@ -24,9 +24,8 @@ from warpflag_kernels.implicit import (
     stability,
     step_flow,
 )
-from warpflag_kernels.motor import hook
-from warpflag_kernels.rod import chain_chart, comoving_chart, hessian, polymorphs
-from warpflag_kernels.stepping import balance, dense_output, evaluation_time, health
+from warpflag_kernels.rod import chain_chart, comoving_chart, hessian
+from warpflag_kernels.stepping import balance, dense_output, evaluation_time, health, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_with_contacts
 
@@ -187,8 +186,7 @@ class ImplicitStepper:
         wp.launch(k.keep_elements, model.element_count, inputs=inputs, device=device)
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
-        polymorphs.flip(model, state, s.chart, s.control, counted=True)
-        hook.follow(model, state, s.chart)
+        terms.after_step(model, state, s.chart, s.control, counted=True)
         if self.stability is not None:
             stability.schedule(model, state, i.evaluations, i.accepted, s.control.longest_step, self.stability)
             wp.capture_if(self.stability.due, self._measure_stability)

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
-from warpflag_kernels.motor import hook
-from warpflag_kernels.rod import comoving_chart, polymorphs, reconstruction
-from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays
+from warpflag_kernels.rod import comoving_chart, reconstruction
+from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
@@ -86,8 +85,7 @@ class RkcStepper:
             dense_output.take(s.model, s.state, s.chart, s.control, self.dense, counted=False)
         comoving_chart.commit(s.model, s.state, s.chart)
         health.remember(s.model, s.state, s.chart, s.guard, s.control)
-        polymorphs.flip(s.model, s.state, s.chart, s.control, counted=False)
-        hook.follow(s.model, s.state, s.chart)
+        terms.after_step(s.model, s.state, s.chart, s.control, counted=False)
         if not self._euler:
             comoving_chart.fit_flagellum_spin(s.model, s.state, s.chart)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,7 +28,7 @@ __all__ = [
 
 
 _POSE = ("position", "tangent", "director", "body_position", "body_orientation")
-_ANGLES, _FORMS = ("flagellum_spin", "motor_angle", "body_angle"), ("form", "before", "changed")
+_ANGLES = ("flagellum_spin", "motor_angle", "body_angle")
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,8 @@ class System:
         carried |= {f"chart.{name}": getattr(chart, name) for name in _ANGLES}
         if self.model.switches.steric:
             carried["guard.position"] = self.guard.position
-        if self.model.switches.has("polymorphs"):
-            carried |= {f"forms.{name}": getattr(self.state.data.forms, name) for name in _FORMS}
-        if self.model.switches.has("hook that stiffens"):
-            carried["motor.on_hook"] = self.state.data.motor.on_hook
-        return carried
+        names = [name for term in self.model.terms for name in term.carried]
+        return carried | {name: attrgetter(name)(self.state.data) for name in names}
 
 
 DEFAULT_ACCURACY = ACCURACY_LEVELS["standard"]

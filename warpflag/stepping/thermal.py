@@ -24,9 +24,8 @@ from warpflag_kernels.implicit import (
     stability,
     step_flow,
 )
-from warpflag_kernels.motor import hook
 from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, reconstruction
-from warpflag_kernels.stepping import dense_output, evaluation_time, health
+from warpflag_kernels.stepping import dense_output, evaluation_time, health, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag_kernels.thermal import additive_chart, closing, equilibrium, mean_drift, strain_gradients
@@ -165,7 +164,7 @@ class ThermalStepper:
             dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
         comoving_chart.commit(model, state, s.chart)
         health.remember(model, state, s.chart, s.guard, s.control)
-        hook.follow(model, state, s.chart)
+        terms.after_step(model, state, s.chart, s.control, counted=True)
         equilibrium.finish_step(model, state, parts, explicit)
         clock.count_pass(s.control, model.device)
 

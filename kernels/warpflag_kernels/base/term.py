@@ -53,6 +53,10 @@ class Term:
             `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
         within_step: the term that stands for this one in an implicit step. None: itself.
         timed: whether it depends on time itself, `State.time`.
+        after_step: changes the term's own state once a step has been accepted and committed, a part of a pass:
+            `after_step(model, state, chart, control, counted)`, `counted` whether the clocks stand at its end already.
+            None: it has no such state.
+        carried: arrays of that state, by their dotted names in `State`; checkpoints hold them.
     """
 
     name: str
@@ -63,6 +67,8 @@ class Term:
     stiffness: Callable[..., None] | None = None
     within_step: "Term | None" = None
     timed: bool = False
+    after_step: Callable[..., None] | None = None
+    carried: tuple[str, ...] = ()
 
 
 def variant(terms: Sequence[Term]) -> str:

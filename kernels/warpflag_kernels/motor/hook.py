@@ -217,14 +217,13 @@ def add_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> Non
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, stiffness], device=model.device)
 
 
-def follow(model: DeviceModel, state: DeviceState, chart: Any) -> None:
+def follow(model: DeviceModel, state: DeviceState, chart: Any, _control: Any, _counted: bool) -> None:
     """Has hooks that stiffen take the torques of their motors; a part of a pass, after the step is committed."""
-    if model.switches.has("hook that stiffens"):
-        kernel = _kernels(model.precision).follow
-        wp.launch(kernel, model.flagellum_count, inputs=[model.data, chart, state.data], device=model.device)
+    kernel = _kernels(model.precision).follow
+    wp.launch(kernel, model.flagellum_count, inputs=[model.data, chart, state.data], device=model.device)
 
 
 HOOK = Term("hook", functions=functions, stiffness=add_stiffness)
 
-HOOK_THAT_STIFFENS = Term("hook that stiffens")
+HOOK_THAT_STIFFENS = Term("hook that stiffens", after_step=follow, carried=("motor.on_hook",))
 """No force of its own: the hook goes by what the motor does, whose torque is not constant."""

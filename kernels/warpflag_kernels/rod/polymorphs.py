@@ -239,9 +239,15 @@ def flip(model: DeviceModel, state: DeviceState, chart: Any, control: Any, count
         model, state, chart, control: of the batch.
         counted: whether the step is in the clocks already.
     """
-    if model.switches.has("polymorphs"):
-        inputs = [model.data, chart, control, int(counted), state.data]
-        wp.launch(_kernels(model.precision).flip, model.flagellum_count, inputs=inputs, device=model.device)
+    inputs = [model.data, chart, control, int(counted), state.data]
+    wp.launch(_kernels(model.precision).flip, model.flagellum_count, inputs=inputs, device=model.device)
 
 
-POLYMORPHS = Term("polymorphs", launch=ground_states, functions=functions, timed=True)
+POLYMORPHS = Term(
+    "polymorphs",
+    launch=ground_states,
+    functions=functions,
+    timed=True,
+    after_step=flip,
+    carried=("forms.form", "forms.before", "forms.changed"),
+)
