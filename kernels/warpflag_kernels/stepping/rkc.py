@@ -25,8 +25,7 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.motor import laws as motor_laws
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
-from warpflag_kernels.stepping import accuracy, step_control
-from warpflag_kernels.stepping import chebyshev as chebyshev_polynomials
+from warpflag_kernels.stepping import accuracy, chebyshev, step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.rkc_arrays import struct
 from warpflag_kernels.stepping.step_control import StepControl
@@ -48,16 +47,15 @@ MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unsta
 
 
 @functools.cache
-def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamespace:
+def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool = False) -> SimpleNamespace:
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
     f = step_control.functions(p, independent=False)
     accept, next_step, smallest = f.accept, f.next_step, f.smallest
     add_estimate = accuracy.functions(independent=False).add
-    advanced, polynomials = clock.functions().advanced, chebyshev_polynomials.functions()
-    chebyshev, weight = polynomials.chebyshev, polynomials.weight
-    module = p.module("euler" if euler else "rkc", "motor_law" if motor_law else "")
+    advanced, coefficients = clock.functions().advanced, chebyshev.functions().coefficients
+    module = p.module("euler" if euler else "rkc", "_".join([*["motor_law"] * motor_law, *["cells"] * by_cells]))
     damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, RADIUS_MARGIN, PROBE_SIZE[p.name]))
     weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
     rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
@@ -78,21 +76,11 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
         next = stage_factor * safety * rkc.spectral_radius[c] * control.longest_step[c]
         return (control.steps[c] > 0 and ended) or next > most_stages * most_stages
 
-    @wp.kernel(module=module)
-    def schedule(
-        # Model:
-        model: Model,
-        # State:
-        steps: StepControl,
-        # Out:
-        state: State,
-        control: Control,
-        rkc: Rkc,
-        chart: Chart,
+    @wp.func(module=module)
+    def schedule_cell(
+        model: Model, steps: StepControl, state: State, control: Control, rkc: Rkc, chart: Chart, c: wp.int32
     ):
-        c = wp.tid()
-        if state.active[c] == 0:
-            return
+        """What this pass evaluates in cell c, and the increment of its body."""
         zero = wp.float64(0.0)
         one = wp.float64(1.0)
         j = rkc.stage[c]
@@ -133,23 +121,7 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
         g = zero
         node = one  # stage time over dt
         if s > 1:
-            w0 = one + damping / wp.float64(s * s)
-            theta = wp.log(w0 + wp.sqrt((w0 - one) * (w0 + one)))
-            last = chebyshev(s, theta)
-            w1 = last[1] / last[2]
-            b = weight(j, theta)
-            if j == 1:
-                m = b * w1
-                node = w1 / (wp.float64(4.0) * w0 * w0)
-            else:
-                b1 = weight(j - 1, theta)
-                b2 = weight(j - 2, theta)
-                here = chebyshev(j, theta)
-                mu = wp.float64(2.0) * b * w0 / b1
-                nu = -b / b2
-                m = wp.float64(2.0) * b * w1 / b1
-                g = -(one - b1 * chebyshev(j - 1, theta)[0]) * m
-                node = w1 * here[2] / here[1]
+            mu, nu, m, g, node = coefficients(j, s, damping)
         rkc.coefficients[c] = wp.vec4d(mu, nu, m * dt, g * dt)
         chart.elapsed[c] = node * dt
         if j == 1:
@@ -164,20 +136,9 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
         rkc.body_previous[c] = y
         chart.body_increment[c] = y
 
-    @wp.kernel(module=module)
-    def combine(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        rkc: Rkc,
-        chart: Chart,
-    ):
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
+    @wp.func(module=module)
+    def combine_element(rkc: Rkc, chart: Chart, e: wp.int32, c: wp.int32):
+        """Increment of element e at the point that this pass evaluates."""
         j = rkc.stage[c]
         if j == -1:
             chart.increment[e] = vec4(real(0.0))
@@ -198,6 +159,43 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
         rkc.before_previous[e] = previous
         rkc.previous[e] = y
         chart.increment[e] = y
+
+    @wp.kernel(module=module)
+    def schedule(
+        # Model:
+        model: Model,
+        # State:
+        steps: StepControl,
+        # Out:
+        state: State,
+        control: Control,
+        rkc: Rkc,
+        chart: Chart,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0:
+            return
+        schedule_cell(model, steps, state, control, rkc, chart, c)
+        if wp.static(by_cells) and state.active[c] != 0:
+            e = model.first_node[model.first_flagellum[c]]
+            while e < model.first_node[model.first_flagellum[c + 1]]:
+                combine_element(rkc, chart, e, c)
+                e += 1
+
+    @wp.kernel(module=module)
+    def combine(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        rkc: Rkc,
+        chart: Chart,
+    ):
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] != 0:
+            combine_element(rkc, chart, e, c)
 
     @wp.kernel(module=module)
     def estimate_error(
@@ -262,23 +260,11 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
             chart.commit[c] = 0
             chart.at_start[c] = 0
 
-    @wp.kernel(module=module)
-    def keep(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        chart: Chart,
-        # Out:
-        rkc: Rkc,
-    ):
-        k = wp.tid()
-        begin = model.first_node[k]
+    @wp.func(module=module)
+    def keep_flagellum(model: Model, chart: Chart, rkc: Rkc, k: wp.int32, c: wp.int32):
+        """Rates of flagellum k that later passes need."""
+        e = model.first_node[k]
         end = model.first_node[k + 1]
-        c = model.cell_of[begin]
-        if state.active[c] == 0:
-            return
-        e = begin
         if chart.at_start[c] != 0:
             while e < end:
                 rkc.start_rate[e] = chart.rate[e]
@@ -295,6 +281,21 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
             rkc.probe_sum[k] = total
 
     @wp.kernel(module=module)
+    def keep(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        chart: Chart,
+        # Out:
+        rkc: Rkc,
+    ):
+        k = wp.tid()
+        c = model.cell_of[model.first_node[k]]
+        if state.active[c] != 0:
+            keep_flagellum(model, chart, rkc, k, c)
+
+    @wp.kernel(module=module)
     def turn_over(
         # Model:
         model: Model,
@@ -308,6 +309,11 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
         c = wp.tid()
         if state.active[c] == 0:
             return
+        if wp.static(by_cells):
+            k = model.first_flagellum[c]
+            while k < model.first_flagellum[c + 1]:
+                keep_flagellum(model, chart, rkc, k, c)
+                k += 1
         rkc.evaluations[c] += 1
         j = rkc.stage[c]
         if chart.at_start[c] != 0:
@@ -348,20 +354,25 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False) -> SimpleNamesp
     )
 
 
+def _kernels_of(model: DeviceModel, euler: bool) -> SimpleNamespace:
+    return _kernels(model.precision, euler, not euler and model.switches.has("motor law"), model.plan.by_cells)
+
+
 def begin_pass(
     model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any, euler: bool
 ) -> None:
     """Increments of this pass' evaluation point, per cell the state itself, a probe or the next stage."""
-    kernels = _kernels(model.precision, euler, not euler and model.switches.has("motor law"))
+    kernels = _kernels_of(model, euler)
     inputs = [model.data, steps, state.data, control, rkc, chart]
     wp.launch(kernels.schedule, model.cell_count, inputs=inputs, device=model.device)
-    inputs = [model.data, state.data, rkc, chart]
-    wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
+    if not model.plan.by_cells:
+        inputs = [model.data, state.data, rkc, chart]
+        wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
 
 
 def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
     """Estimates the error of every completed step and clears `commit` where the step is rejected."""
-    kernels = _kernels(model.precision, False, model.switches.has("motor law"))
+    kernels = _kernels_of(model, euler=False)
     inputs = [model.data, state.data, control, chart, rkc]
     wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, control, steps, chart]
@@ -370,8 +381,9 @@ def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:
     """Stores what later stages need and advances the stage counter of every cell."""
-    kernels = _kernels(model.precision, euler, not euler and model.switches.has("motor law"))
-    inputs = [model.data, state.data, chart, rkc]
-    wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
+    kernels = _kernels_of(model, euler)
+    if not model.plan.by_cells:
+        inputs = [model.data, state.data, chart, rkc]
+        wp.launch(kernels.keep, model.flagellum_count, inputs=inputs, device=model.device)
     inputs = [model.data, chart, state.data, control, rkc]
     wp.launch(kernels.turn_over, model.cell_count, inputs=inputs, device=model.device)
