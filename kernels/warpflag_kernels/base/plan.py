@@ -13,6 +13,7 @@ from warpflag_kernels.base.precision import Precision
 
 WARP = 32  # threads of a warp
 CONTACT_BLOCK = 128  # threads that solve the contacts of one cell on a GPU: an SM's four warp schedulers, one warp each
+GATHERING_BLOCK = 256  # threads of a block that gathers pairs on a GPU: what Warp takes where nothing is said
 # Nodes of a cell up to which the coefficients of its pairs are stored during a step: N^2/2 pairs of four float32 are
 # 2 MB then, what a core's second-level cache holds; beyond, reading them takes as long as finding them again.
 STORED_NODES = 512
@@ -143,6 +144,11 @@ class Plan:
     def gathering_threads(self) -> int:
         """Threads that gather the pairs of one node together."""
         return WARP if self.pair_sum == "warp" else 1
+
+    @property
+    def gathering_block(self) -> int:
+        """Threads of a block that gathers pairs; on a CPU those of a warp, fibers that meet."""
+        return WARP if self.gathering_threads > 1 and self.device.is_cpu else GATHERING_BLOCK
 
     def summary(self) -> str:
         """The choices in a line, for people."""

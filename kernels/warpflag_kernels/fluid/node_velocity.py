@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpflag_kernels.base.plan import WARP, Flows
+from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body_flow, rotne_prager
@@ -161,7 +161,6 @@ def _gather(model: DeviceModel, state: DeviceState, kernels: SimpleNamespace) ->
     inputs = [model.data, state.data, state.pairs]
     if plan.pair_sum != "none":
         wp.launch(kernels.pack, model.element_count, inputs=inputs, device=device)
-    threads = plan.gathering_threads
-    block = WARP if threads > 1 and device.is_cpu else 256  # on a CPU the threads of a block are fibers that meet
+    shape = model.element_count, plan.gathering_threads
     inputs = [model.data, state.pairs, state.data]
-    wp.launch(kernels.velocities, (model.element_count, threads), inputs=inputs, device=device, block_dim=block)
+    wp.launch(kernels.velocities, shape, inputs=inputs, device=device, block_dim=plan.gathering_block)
