@@ -245,12 +245,12 @@ class ThermalStepper:
             for _ in range(RENEWALS):
                 self._renew_contacts(found)
                 self._solve_contacts(self._x, found)
+            if self._flows:
+                closing.set_difference(model, state, found, self._x, self._by_contacts)
+                closing.mark(model, state, parts.contacts, parts.law, self._in_contact, anew=True)
         if self.motors is not None:
             self._solve_motors(found)
         if self._flows:
-            if self._touching:
-                closing.set_difference(model, state, found, self._x, self._by_contacts)
-                closing.mark(model, state, parts.contacts, parts.law, self._in_contact, anew=True)
             self._solve_in_full(found, self.stability)
             if self._touching:
                 self._close(found)
