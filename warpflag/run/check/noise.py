@@ -26,7 +26,8 @@ def of_noise(scene: Scene, step: float) -> list[str]:
     method = "Euler-Maruyama" if numerics.stepper == "euler" else "linearly implicit with a random elastic force"
     return [
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
-        "joints hardly depend on the step, but driven motion errs in proportion to it: halve it and compare",
+        "joints err by up to 1 % at 1e-5 s, gaps of contacts by 5 % at 1e-6 s, driven motion in proportion to the "
+        "step: halve it and compare",
         f"noise alone turns a flagellum about its hook: tip by about {tip:.2g} um in {1e3 * scene.duration:g} ms, "
         f"{tip * math.sqrt(step / scene.duration):.1g} um in a step",
     ]
