@@ -134,7 +134,7 @@ CONSTANTS = {
     "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
     "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
     "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), CONTACT_LAW),
-    "contact_loops.NEWTON_STEPS": Constant("implicit.contact_loops", (4, 1, 2, 3, 6), CONTACT_LAW),
+    "contact_solve.NEWTON_STEPS": Constant("implicit.contact_solve", (4, 1, 2, 3, 6), CONTACT_LAW),
     "quasi_newton.KEPT": Constant(
         "implicit.quasi_newton",
         (16, 2, 4, 8, 32),

@@ -20,6 +20,7 @@ from warpflag_kernels.implicit import (
     krylov,
     linearised,
     motor_solve,
+    prediction,
     quasi_newton,
     stability,
     step_flow,
@@ -64,29 +65,31 @@ class Scratch:
         predicted: e of the quadratic path through the last two steps, at the start of the step.
         expected: the same, transported to the first pose.
         last_at_first, last_at_second: the last step's increment, transported to the first and the second pose.
-        found: e as the first iteration left it, transported to the second pose.
+        start: the increment to the first pose.
+        joined: e as the first iteration left it.
+        found: the same, transported to the second pose.
         free: solution of an iteration before the contact forces are solved for.
         solved: the same with the contact forces.
         total: the whole step.
         remaining: what of the step is left to go from the second pose.
-        zero: an increment of zero.
     """
 
     predicted: Any
     expected: Any
     last_at_first: Any
     last_at_second: Any
+    start: Any
+    joined: Any
     found: Any
     free: Any
     solved: Any
     total: Any
     remaining: Any
-    zero: Any
 
     @staticmethod
     def allocate(model: DeviceModel) -> Scratch:
         """Increments of zero."""
-        return Scratch(*(chain_chart.allocate(model) for _ in range(10)))
+        return Scratch(*(chain_chart.allocate(model) for _ in range(11)))
 
 
 class ImplicitStepper:
@@ -144,13 +147,12 @@ class ImplicitStepper:
         if model.timed:
             evaluation_time.within_step(state, s.control, i.theta, device)
         # The first iteration, where the last steps lead.
-        inputs = [model.data, state.data, i, last, before, x.predicted]
-        wp.launch(k.predict, model.element_count, inputs=inputs, device=device)
+        prediction.predict(model, state, i, last, before, x.predicted, x.start)
         transported = (last, x.predicted, x.last_at_first, x.expected)
-        chain_chart.retract(model, state, s.chart.base, i.ahead, last, pose, transported)
+        chain_chart.retract(model, state, s.chart.base, i.one, x.start, pose, transported)
         if self._touching:
             search.find(model, state, pose, self.contacts)
-            contact_solve.warm_start(model, state, i.trust, x.expected, self.contacts, self.law)
+            contact_solve.warm_start(model, state, i.awaited, x.expected, self.contacts, self.law)
         if model.switches.pairs != "none":
             step_flow.build(model, state, self.flow, self.contacts if self._touching else None)
         self._evaluate(in_single=step_flow.stores_pairs(model))
@@ -158,15 +160,16 @@ class ImplicitStepper:
         linearised.factorise(model, state, self.stiffness, band)
         if self._motor_law:
             motor_solve.prepare(model, state, band, self._motors)
-        solution = self._solve(x.last_at_first, x.zero, first=True)
+        solution = self._solve(x.last_at_first, x.expected, i.begun, first=True)
+        prediction.join(model, state, i, x.expected, solution, x.joined)
         # The second, where the first one led.
-        transported = (x.last_at_first, solution, x.last_at_second, x.found)
+        transported = (x.last_at_first, x.joined, x.last_at_second, x.found)
         chain_chart.retract(model, state, pose, i.one, solution, pose, transported)
         if self._touching:
             search.renew(model, state, pose, self.contacts)
         self._evaluate()
         balance.gather(model, state, self.balance)
-        solution = self._solve(x.last_at_second, x.found, first=False)
+        solution = self._solve(x.last_at_second, x.found, i.one, first=False)
         inputs = [model.data, state.data, x.last_at_second, x.found, x.expected, solution]
         inputs += [i, x.total, x.remaining, s.chart]
         wp.launch(k.complete, model.flagellum_count, inputs=inputs, device=device)
@@ -204,15 +207,16 @@ class ImplicitStepper:
         else:
             node_velocity.node_velocities(model, state)
 
-    def _solve(self, last: Any, found: Any, first: bool) -> Any:
+    def _solve(self, last: Any, found: Any, weight: Any, first: bool) -> Any:
         """The increment that is still missing at the present pose.
 
         Args:
             last, found: the last increment, and what has been found of this one, both at the present pose.
+            weight: share of `found` that counts, shape [cell_count].
             first: whether this is the first iteration, whose gaps need not be as fine.
         """
         model, state, x = self._system.model, self._system.state, self._scratch
-        inputs = [model.data, state.data, self.data, self.band, self.law, last, found, x.free]
+        inputs = [model.data, state.data, self.data, self.band, self.law, last, found, weight, x.free]
         kernel = collocation.kernels(model.precision).right_hand_side
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
         linearised.solve(model, state, self.band, x.free)
@@ -225,7 +229,7 @@ class ImplicitStepper:
             wp.capture_if(self.stability.any_strong, self._solve_in_full)
         if self._motor_law:
             motor_solve.solve(
-                model, state, self.data, self.band, self.law.gain, self._motors, last, found, self._solution
+                model, state, self.data, self.band, self.law.gain, self._motors, last, found, weight, self._solution
             )
         return self._solution
 
@@ -253,7 +257,7 @@ class ImplicitStepper:
         counts = np.diff(self._system.model.data.first_flagellum.numpy())
         self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
         self.data.history.zero_()
-        self.data.trust.zero_()
+        self.data.share.zero_()
         self.balance.known.zero_()
         self.balance.lasting.zero_()
         if self.stability is not None:
@@ -262,7 +266,7 @@ class ImplicitStepper:
         restart_step_control(self.steps, self._system.control.longest_step.numpy() / 64)
 
     def memory(self) -> dict[str, np.ndarray]:
-        names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "trust")
+        names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "share")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= step_memory(self.steps)
         kept |= {f"balance_{name}": getattr(self.balance, name).numpy().copy() for name in balance.MEMORY}

@@ -293,7 +293,9 @@ class ThermalStepper:
         """Puts motors on their laws. The full mobility shifts their rates a little, so it is done before and after it
         is solved with: what is left errs by the square of that share."""
         model, state, parts, none = self._system.model, self._system.state, self._parts, self._none
-        motor_solve.solve(model, state, self._data, parts.band, parts.law.gain, self.motors, none, none, x)
+        motor_solve.solve(
+            model, state, self._data, parts.band, parts.law.gain, self.motors, none, none, self._data.one, x
+        )
 
     def _left_over(self) -> dict[str, wp.array]:
         """What an implicit step leaves to the next one."""

@@ -9,7 +9,8 @@ theta w delta + e, so
 and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
 theta above 2^-1/2, but alternate in sign for some steps below 1. So the last step of an advance takes theta = 1, which
 is BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside do not. Both
-iterations evaluate V once, at the pose known so far, and solve for what is missing:
+iterations evaluate V once, at the pose known so far, and solve for what is missing; the first one begins with a share
+of the e that the last three states predict:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
@@ -43,9 +44,13 @@ from warpflag_kernels.stepping.step_control import StepControl
 # falls with it as 3 theta^2 - 1, but stiff modes die out more slowly: a step leaves 0.67 of them at
 # 0.8 and 0.84 at 0.75 (docs/numerics.md).
 THETA = 0.8
-# Error estimate over the mean predictor error of a cell's nodes, for theta = 1; measured. The mean is controlled,
-# since contacts that open, close or pass a vertex make single nodes jump, which does not add up over time.
-ERROR_PER_PREDICTOR = 7.0
+# Error estimate over the mean predictor error of the nodes of a flagellum, that with the largest mean, for theta = 1;
+# measured. The mean is controlled, since contacts that open, close or pass a vertex make single nodes jump, which does
+# not add up over time.
+ERROR_PER_PREDICTOR = 3.5
+# Over-implicitness up to which a step may begin with all of the prediction. Beyond, the two iterations leave so much of
+# it in stiff modes that an extrapolation through three states would be unstable (docs/numerics.md).
+BEGUN_PER_OVER_IMPLICIT = 1.6
 GAP_SHARE = 0.1  # residual of the gaps that the contact solve may leave, over the error that a step may make
 # A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
 GAP_GROWTH = 4.0e9
@@ -70,8 +75,11 @@ def struct(p: Precision) -> Any:
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
         one: wp.array(dtype=wp.float64)  # 1, the scale of a retraction by a whole increment
         predictor_error: wp.array(dtype=real)  # [K], predictor error: sum over the nodes of |e - predicted e| [um]
-        predicted_displacement: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e| [um]
-        trust: wp.array(dtype=wp.float64)  # 1 less the predictor error of the last step over its prediction, at least 0
+        along: wp.array(dtype=real)  # [K], sum over the nodes of e . predicted e [um^2]
+        predicted: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e|^2 [um^2]
+        share: wp.array(dtype=wp.float64)  # of predicted e in e of the last step, by least squares, from 0 to 1
+        begun: wp.array(dtype=wp.float64)  # share of predicted e that this step begins with
+        awaited: wp.array(dtype=wp.float64)  # share of predicted e that gaps are predicted with beyond that
         accepted: wp.array(dtype=wp.int32)
         evaluations: wp.array(dtype=wp.int32)  # steps attempted so far
 
@@ -83,11 +91,11 @@ def allocate(model: DeviceModel) -> Any:
     p, device = model.precision, model.device
     i = struct(p)()
     floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "reach")
-    for name in (*floats, "curvature", "trust"):
+    for name in (*floats, "curvature", "share", "begun", "awaited"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
     for name in ("history", "accepted", "evaluations"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
-    for name in ("predictor_error", "predicted_displacement"):
+    for name in ("predictor_error", "along", "predicted"):
         setattr(i, name, wp.zeros(model.flagellum_count, dtype=p.real, device=device))
     i.one = wp.ones(model.cell_count, dtype=wp.float64, device=device)
     return i
@@ -110,7 +118,9 @@ def kernels(p: Precision) -> SimpleNamespace:
     module = p.module("collocation")
     Balance, keeps, counted = balance.struct(p), balance.functions(p).kept, balance.functions(p).count
     round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
-    theta_inside, per_predictor = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(ERROR_PER_PREDICTOR))
+    theta_inside, per_predictor, begun_per = (
+        wp.constant(wp.float64(x)) for x in (THETA, ERROR_PER_PREDICTOR, BEGUN_PER_OVER_IMPLICIT)
+    )
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved, inaccurate, unbalanced = (
         wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE)
@@ -156,6 +166,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
             imp.curvature[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
+        imp.begun[c] = imp.share[c] * wp.min(one, begun_per / imp.over_implicit[c])
+        imp.awaited[c] = imp.share[c] - imp.begun[c]
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]
         band.singular[c] = 0
@@ -168,29 +180,6 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.evaluations[c] += 1
 
     @wp.kernel(module=module)
-    def predict(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        imp: Implicit,
-        last: Increment,
-        before: Increment,
-        # Out:
-        predicted: Increment,
-    ):
-        """The predictor: e of the quadratic path through the last three states."""
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        scale = real(imp.curvature[c])
-        ratio = real(imp.ratio_before[c])
-        predicted.node[e] = scale * (last.node[e] - ratio * before.node[e])
-        if e == model.first_node[model.first_flagellum[c]]:
-            predicted.body[c] = scale * (last.body[c] - ratio * before.body[c])
-
-    @wp.kernel(module=module)
     def right_hand_side(
         # Model:
         model: Model,
@@ -201,6 +190,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         law: Law,
         last: Increment,
         found: Increment,
+        weight: wp.array(dtype=wp.float64),
         # Out:
         x: Increment,
     ):
@@ -212,7 +202,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         gain = real(law.gain[c])
         inv_dt = real(wp.float64(1.0) / band.step[c])
         slope = gain * real(imp.ratio[c] / band.step[c])
-        known = slope * last.node[e] + inv_dt * found.node[e]
+        part = real(weight[c]) * inv_dt
+        known = slope * last.node[e] + part * found.node[e]
         spin = gain * model.drag.spin_mobility[k] * state.spin_torque[e] - known[3]
         v = vec3(real(0.0))
         if e > model.first_node[k]:
@@ -222,7 +213,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             u = state.body_velocity[c]
             w = state.body_spin[c]
             rate = gain * vec6(u[0], u[1], u[2], w[0], w[1], w[2])
-            x.body[c] = rate - slope * last.body[c] - inv_dt * found.body[c]
+            x.body[c] = rate - slope * last.body[c] - part * found.body[c]
         x.node[e] = vec4(v[0], v[1], v[2], spin / model.drag.spin_mobility[k])
 
     @wp.kernel(module=module)
@@ -241,7 +232,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         remaining: Increment,
         chart: Chart,
     ):
-        """The whole step, what remains of it from the present pose, and the predictor error of a flagellum."""
+        """The whole step, what remains of it from the present pose, and how far a flagellum is from its prediction."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
@@ -251,7 +242,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         ahead = real(imp.ahead[c])
         whole = real(wp.float64(1.0) / imp.reach[c])
         predictor_error = real(0.0)
-        predicted_displacement = real(0.0)
+        along = real(0.0)
+        squared = real(0.0)
         e = first
         while e < model.first_node[k + 1]:
             f = found.node[e] + x.node[e]
@@ -262,12 +254,14 @@ def kernels(p: Precision) -> SimpleNamespace:
             remaining.node[e] = t - ahead * last.node[e] - found.node[e]
             if e > first:
                 predictor_error += wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-                predicted_displacement += wp.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+                along += f[0] * p[0] + f[1] * p[1] + f[2] * p[2]
+                squared += p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
             e += 1
         if imp.history[c] != 2:
             predictor_error = real(0.0)
         imp.predictor_error[k] = whole * predictor_error
-        imp.predicted_displacement[k] = whole * predicted_displacement
+        imp.along[k] = along
+        imp.predicted[k] = squared
         chart.increment[first] = vec4(real(0.0), real(0.0), real(0.0), total.node[first][3])
         if k == model.first_flagellum[c]:
             b = w * last.body[c] + whole * (found.body[c] + x.body[c])
@@ -299,16 +293,17 @@ def kernels(p: Precision) -> SimpleNamespace:
         dt = control.step[c]
         predictor_error = wp.float64(0.0)
         k = model.first_flagellum[c]
-        predicted_displacement = wp.float64(0.0)
-        nodes = int(0)
+        along = wp.float64(0.0)
+        squared = wp.float64(0.0)
         while k < model.first_flagellum[c + 1]:
-            predictor_error += wp.float64(imp.predictor_error[k])
-            predicted_displacement += wp.float64(imp.predicted_displacement[k])
-            nodes += model.first_node[k + 1] - model.first_node[k] - 1
+            nodes = model.first_node[k + 1] - model.first_node[k] - 1
+            predictor_error = wp.max(predictor_error, wp.float64(imp.predictor_error[k]) / wp.float64(nodes))
+            along += wp.float64(imp.along[k])
+            squared += wp.float64(imp.predicted[k])
             k += 1
         theta = imp.theta[c]
         truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
-        error = per_predictor * truncated * predictor_error / wp.float64(nodes)
+        error = per_predictor * truncated * predictor_error
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         lasts = bool(False)
@@ -323,9 +318,9 @@ def kernels(p: Precision) -> SimpleNamespace:
             powers.stored[c] = energy
             powers.known[c] = 1
             imp.accepted[c] = 1
-            imp.trust[c] = wp.float64(0.0)
-            if predictor_error < predicted_displacement:
-                imp.trust[c] = wp.float64(1.0) - predictor_error / predicted_displacement
+            imp.share[c] = wp.float64(0.0)
+            if squared > wp.float64(0.0):
+                imp.share[c] = wp.clamp(along / squared, wp.float64(0.0), wp.float64(1.0))
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)
@@ -387,7 +382,6 @@ def kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(
         begin=begin,
         right_hand_side=right_hand_side,
-        predict=predict,
         complete=complete,
         decide=decide,
         keep_elements=keep_elements,

@@ -20,21 +20,57 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base.native import native
 from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, steric
-from warpflag_kernels.implicit import block_band, contact_loops, delassus, quasi_newton
+from warpflag_kernels.contact.constants import CUTOFF, LINEAR_BELOW
+from warpflag_kernels.implicit import block_band, delassus, quasi_newton
 from warpflag_kernels.implicit import step_flow as flow_stage
 from warpflag_kernels.implicit.delassus import meet, struct
 from warpflag_kernels.rod import chain_chart
 
+NEWTON_STEPS = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
 ITERATIONS = 60  # at most; crowds take some ten
 FINEST = 1.0e-6  # least tolerance of a gap [sigma]; below, the residual is round-off of the float32 flows
 # Diagonal compliance over that of the nodes' local drag alone: elasticity and neighbours hold a node as well.
 DIAGONAL_PER_DRAG = 0.25
 DEEP = 0.75  # below this gap a solution starts from the contact's own scalar equation [sigma]
 DEEPEST = 0.9  # predicted gaps are taken to be at least this [sigma]: forces of deeper ones would overshoot
+
+
+@functools.cache
+def _loops(p: Precision, threads: int) -> SimpleNamespace:
+    """Device functions over the contacts [begin, stop) of one cell, for one thread of so many.
+
+    They are in C++ so that a CPU's compiler makes vector code of them; on a GPU the threads of a block share each loop.
+    """
+    real, Law, Increment = p.real, struct(p), chain_chart.types(p).Increment
+
+    law, bits = steric.law_code(p), {"float64": "long long", "float32": "int"}[p.name]
+
+    @wp.func_native(native(__file__, "load_contacts", p, LAW=law, THREADS=threads))
+    def load_all(
+        law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32
+    ) -> real: ...
+
+    @wp.func_native(native(__file__, "add_product", p, THREADS=threads))
+    def take(
+        law_in: Law, x: Increment, begin: wp.int32, stop: wp.int32, first: wp.int32, end: wp.int32, thread: wp.int32
+    ): ...
+
+    @wp.func_native(native(__file__, "residuals", p, THREADS=threads, BITS=bits))
+    def leave(law_in: Law, begin: wp.int32, stop: wp.int32, thread: wp.int32) -> real: ...
+
+    words = {"NEWTON_STEPS": NEWTON_STEPS, "CUTOFF": CUTOFF, "LINEAR": LINEAR_BELOW}
+
+    @wp.func_native(native(__file__, "solve_single_contacts", p, LAW=law, THREADS=threads, **words))
+    def solve_single(
+        law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32
+    ): ...
+
+    return SimpleNamespace(load_all=load_all, take=take, leave=leave, solve_single=solve_single)
 
 
 @functools.cache
@@ -47,7 +83,7 @@ def _kernels(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: 
     gap_change = contact_list.functions(p).gap_change
     product = delassus.functions(p, flows, step_pairs, chains, threads).product
     block_sum, block_max = delassus.reductions(p, threads).block_sum, delassus.reductions(p, threads).block_max
-    loops = contact_loops.functions(p, threads)
+    loops = _loops(p, threads)
     load_all, take, leave, solve_single = loops.load_all, loops.take, loops.leave, loops.solve_single
     secants = quasi_newton.functions(p, threads)
     learn, combine = secants.learn, secants.combine

@@ -159,6 +159,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         gain: wp.array(dtype=wp.float64),
         last: Increment,
         found: Increment,
+        weight: wp.array(dtype=wp.float64),
         x: Increment,
         # Out:
         state: State,
@@ -172,12 +173,13 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         ratio = real(imp.ratio[c])
         begin = model.first_flagellum[c]
         end = model.first_flagellum[c + 1]
-        before = ratio * last.body[c] + (found.body[c] + x.body[c]) / g
+        part = real(weight[c])
+        before = ratio * last.body[c] + (part * found.body[c] + x.body[c]) / g
         spin = vec3(before[3], before[4], before[5])
         k = begin
         while k < end:
             first = model.first_node[k]
-            turned = ratio * last.node[first][3] + (found.node[first][3] + x.node[first][3]) / g
+            turned = ratio * last.node[first][3] + (part * found.node[first][3] + x.node[first][3]) / g
             motors.free_rate[k] = per_step * (turned - wp.dot(state.pose.tangent[first], spin))
             k += 1
         moved = vec6(real(0.0))  # motion of the body that the changes of torque cause, over g
@@ -278,7 +280,16 @@ def prepare(model: DeviceModel, state: DeviceState, band: Any, motors: Any) -> N
 
 
 def solve(
-    model: DeviceModel, state: DeviceState, data: Any, band: Any, gain: Any, motors: Any, last: Any, found: Any, x: Any
+    model: DeviceModel,
+    state: DeviceState,
+    data: Any,
+    band: Any,
+    gain: Any,
+    motors: Any,
+    last: Any,
+    found: Any,
+    weight: Any,
+    x: Any,
 ) -> None:
     """Puts every motor on its law: the torques in `State.motor.held`, and what their changes do to an increment.
 
@@ -286,10 +297,11 @@ def solve(
         model, state: of the batch, with the pose that x is an increment of, at the time of the collocation point.
         data, band, gain, motors: structs `Implicit` and `Band`, g, and what `prepare` has found.
         last, found: the last increment, and what has been found of this one, both at the present pose.
+        weight: share of `found` that counts, shape [cell_count].
         x: what an iteration has found with the torques as they were; changed.
     """
     kernels, device = _kernels(model.precision, model.switches.noise, model.switches.flows.body), model.device
-    inputs = [model.data, data, band, gain, last, found, x, state.data, motors]
+    inputs = [model.data, data, band, gain, last, found, weight, x, state.data, motors]
     wp.launch(kernels.find_torques, model.cell_count, inputs=inputs, device=device)
     inputs = [model.data, state.data, band, gain, motors, x]
     wp.launch(kernels.add_changes, model.element_count, inputs=inputs, device=device)

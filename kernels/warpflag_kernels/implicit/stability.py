@@ -6,6 +6,14 @@ over-implicitness w, a step of two iterations multiplies such a mode by (1 - kap
 kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
 product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
 
+In flexible cells kappa is the Rayleigh quotient of the probe x in the inner product with H, in which both sides are
+symmetric: with the forces f = -H x,
+
+    kappa = w (x.H x/dt + g f.M f) / (x.H x/dt + w g f.D f),
+
+never more than the eigenvalue. In stiff cells it is the growth of the probe's length, which, as the product is not
+symmetric there, may exceed the eigenvalue, and tells of modes that two iterations would magnify at first.
+
 The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
 in flexible cells; where kappa is large, in stiff ones, the equations are solved with the full mobility (`krylov`).
 One or two flexible flagella need little more than the least w and are measured rarely.
@@ -21,6 +29,7 @@ import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
+from warpflag_kernels.fluid import body
 from warpflag_kernels.implicit import linearised
 from warpflag_kernels.rod import chain_chart
 
@@ -59,6 +68,11 @@ def struct(p: Precision) -> Any:
         strong: wp.array(dtype=wp.int32)  # 1: kappa is large, the equations are solved with the full mobility
         any_strong: wp.array(dtype=wp.int32)  # [1], 1: some cell's is
         size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part of a product
+        # Of the probe x and its forces f = -H x, by flagellum [K]: x.H x [pN um], f.M f and f.D f [pN um/s]; the last
+        # without the body's part.
+        stored: wp.array(dtype=wp.float64)
+        full: wp.array(dtype=wp.float64)
+        local: wp.array(dtype=wp.float64)
 
     return Stability
 
@@ -69,7 +83,8 @@ def allocate(model: DeviceModel) -> Any:
     cells, device = model.cell_count, model.device
     s = struct(model.precision)()
     s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
-    s.size = wp.zeros(model.flagellum_count, dtype=wp.float64, device=device)
+    for name in ("size", "stored", "full", "local"):
+        setattr(s, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
     s.measured, s.active, s.strong = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(3))
     # Conditional kernels load in the first pass, which takes no step.
     s.due, s.any_strong = (wp.ones(1, dtype=wp.int32, device=device) for _ in range(2))
@@ -83,7 +98,7 @@ def allocate(model: DeviceModel) -> Any:
 @functools.cache
 def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     """The kernels; those of cells with flow round their bodies, or without."""
-    real = p.real
+    real, vec3, respond = p.real, p.vec3, body.mobility(p).respond
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability", "body_flow" if body_flow else "")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
@@ -167,6 +182,71 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         state.active[c] = stability.measured[c]
 
     @wp.kernel(module=module)
+    def dissipate(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        probe: Increment,
+        # Out:
+        stability: Stability,
+    ):
+        """What the probe stores, and what its forces dissipate with the full mobility and with the local one."""
+        k = wp.tid()
+        first = model.first_node[k]
+        c = model.cell_of[first]
+        if stability.measured[c] == 0:
+            return
+        spin_mobility = model.drag.spin_mobility[k]
+        force = state.flagellum_force[k]
+        torque = state.flagellum_torque[k]
+        b = probe.body[c]
+        stored = -wp.dot(force, vec3(b[0], b[1], b[2])) - wp.dot(torque, vec3(b[3], b[4], b[5]))
+        full = wp.dot(force, state.body_velocity[c]) + wp.dot(torque, state.body_spin[c])
+        local = real(0.0)
+        e = first
+        while e < model.first_node[k + 1]:
+            spin_torque = state.spin_torque[e]
+            x = probe.node[e]
+            stored -= spin_torque * x[3]
+            spin_power = spin_mobility * spin_torque * spin_torque
+            local += spin_power
+            full += spin_power
+            if e > first:
+                f = state.force[e]
+                across = model.drag.mobility_across[e]
+                along = wp.dot(f, state.pose.tangent[e])
+                stored -= wp.dot(f, vec3(x[0], x[1], x[2]))
+                local += across * wp.dot(f, f) + (model.drag.mobility_along[e] - across) * along * along
+                full += wp.dot(f, state.velocity[e])
+            e += 1
+        stability.stored[k] = wp.float64(stored)
+        stability.full[k] = wp.float64(full)
+        stability.local[k] = wp.float64(local)
+
+    @wp.func(module=module)
+    def quotient(
+        model: Model, state: State, stability: Stability, c: wp.int32, dt: wp.float64, g: wp.float64, w: wp.float64
+    ):
+        """The Rayleigh quotient of the probe, times the over-implicitness w."""
+        stored = wp.float64(0.0)
+        full = wp.float64(0.0)
+        local = wp.float64(0.0)
+        force = vec3(real(0.0))
+        torque = vec3(real(0.0))
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            stored += stability.stored[k]
+            full += stability.full[k]
+            local += stability.local[k]
+            force += state.flagellum_force[k]
+            torque += state.flagellum_torque[k]
+            k += 1
+        velocity, spin = respond(model, state, c, force, torque)
+        local += wp.float64(wp.dot(force, velocity) + wp.dot(torque, spin))
+        return w * (stored / dt + g * full) / (stored / dt + w * g * local)
+
+    @wp.kernel(module=module)
     def measure(
         # Model:
         model: Model,
@@ -201,6 +281,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         # State:
         response: Increment,
         step: wp.array(dtype=wp.float64),
+        gain: wp.array(dtype=wp.float64),
         longest_step: wp.array(dtype=wp.float64),
         # Out:
         stability: Stability,
@@ -222,19 +303,19 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             weak = weakly_coupled(model, c, longest_step[c])
             crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
             flexible = weak or (crowd and not rod_like(model, c, step[c]))
+            # The growth of a probe of any direction may exceed kappa by far: stiff cells are solved with the full
+            # mobility until their probe has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]
-            # The first product, of a probe of any direction, may exceed kappa by far. Cells measured rarely do not use
-            # it: it only turns the probe toward the leading eigenvector. The others use it, and so are solved with the
-            # full mobility until their probe has turned.
-            if stability.kappa[c] > wp.float64(0.0) or not weak:
-                most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
-                stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
-                if stability.strong[c] != 0:
-                    stability.any_strong[0] = 1
-                if flexible and stability.strong[c] == 0:
-                    over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
-                else:
-                    over_implicit[c] = least
+            if flexible:
+                kappa = quotient(model, state, stability, c, step[c], gain[c], over_implicit[c])
+            most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
+            stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
+            if stability.strong[c] != 0:
+                stability.any_strong[0] = 1
+            if flexible and stability.strong[c] == 0:
+                over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
+            else:
+                over_implicit[c] = least
             stability.kappa[c] = kappa
             scale = real(wp.float64(1.0) / ratio)
             stability.probe.body[c] = scale * response.body[c]
@@ -243,7 +324,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
                 stability.probe.node[e] = scale * stability.probe.node[e]
                 e += 1
 
-    return SimpleNamespace(schedule=schedule, mask=mask, measure=measure, choose=choose)
+    return SimpleNamespace(schedule=schedule, mask=mask, dissipate=dissipate, measure=measure, choose=choose)
 
 
 def schedule(
@@ -288,8 +369,10 @@ def measure(
     kernels, device = _kernels(model.precision, model.switches.flows.body), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
+    inputs = [model.data, state.data, stability.probe, stability]
+    wp.launch(kernels.dissipate, model.flagellum_count, inputs=inputs, device=device)
     linearised.solve(model, state, band, response)
     inputs = [model.data, response, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
-    inputs = [model.data, response, band.step, longest_step, stability, over_implicit, state.data]
+    inputs = [model.data, response, band.step, gain, longest_step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)

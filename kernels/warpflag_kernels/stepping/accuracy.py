@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
-CORRELATION = 2.0e-6  # time within which errors of steps have equal sign where they are otherwise independent [s]
+CORRELATION = 5.0e-6  # time within which errors of steps have equal sign where they are otherwise independent [s]
 WINDOW = 1.0e-4  # time over which the worst estimate is taken [s]: some ten steps and more
 # Steps of the shortest length that are not counted after the start of a scene, 1 us in water: what the start leaves
 # stretched and pressed relaxes then, and estimates see that as error.
