@@ -48,9 +48,9 @@ THETA = 0.8
 # measured. The mean is controlled, since contacts that open, close or pass a vertex make single nodes jump, which does
 # not add up over time.
 ERROR_PER_PREDICTOR = 3.5
-# Over-implicitness up to which a step may begin with all of the prediction. Beyond, the two iterations leave so much of
-# it in stiff modes that an extrapolation through three states would be unstable (docs/numerics.md).
-BEGUN_PER_OVER_IMPLICIT = 1.6
+# Over-implicitness up to which a step may begin with all of the prediction, the least there is. Beyond, two iterations
+# leave so much of it in stiff modes that an extrapolation through three states would ring (docs/numerics.md).
+BEGUN_WHOLE = 1.3
 GAP_SHARE = 0.1  # residual of the gaps that the contact solve may leave, over the error that a step may make
 # A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
 GAP_GROWTH = 4.0e9
@@ -118,8 +118,8 @@ def kernels(p: Precision) -> SimpleNamespace:
     module = p.module("collocation")
     Balance, keeps, counted = balance.struct(p), balance.functions(p).kept, balance.functions(p).count
     round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
-    theta_inside, per_predictor, begun_per = (
-        wp.constant(wp.float64(x)) for x in (THETA, ERROR_PER_PREDICTOR, BEGUN_PER_OVER_IMPLICIT)
+    theta_inside, per_predictor, whole_up_to = (
+        wp.constant(wp.float64(x)) for x in (THETA, ERROR_PER_PREDICTOR, BEGUN_WHOLE)
     )
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved, inaccurate, unbalanced = (
@@ -166,7 +166,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         if imp.history[c] == 2:
             imp.ratio_before[c] = imp.last_step[c] / imp.step_before[c]
             imp.curvature[c] = rho * w * (w + one) / (one + imp.step_before[c] / imp.last_step[c])
-        imp.begun[c] = imp.share[c] * wp.min(one, begun_per / imp.over_implicit[c])
+        most = wp.min(one, whole_up_to / imp.over_implicit[c])
+        imp.begun[c] = imp.share[c] * most * most
         imp.awaited[c] = imp.share[c] - imp.begun[c]
         band.step[c] = dt
         band.weight[c] = g * imp.over_implicit[c]

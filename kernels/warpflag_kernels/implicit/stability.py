@@ -6,17 +6,17 @@ over-implicitness w, a step of two iterations multiplies such a mode by (1 - kap
 kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
 product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
 
-In flexible cells kappa is the Rayleigh quotient of the probe x in the inner product with H, in which both sides are
-symmetric: with the forces f = -H x,
+kappa is taken to be the growth of the probe's length. The product is not symmetric, so that may exceed the eigenvalue; it
+tells of modes that two iterations would magnify at first. One or two flexible flagella need little more than the least w
+and are measured rarely; a probe that lags behind would grow too much then. There kappa is the Rayleigh quotient of the
+probe x in the inner product with H, in which both sides are symmetric: with the forces f = -H x,
 
     kappa = w (x.H x/dt + g f.M f) / (x.H x/dt + w g f.D f),
 
-never more than the eigenvalue. In stiff cells it is the growth of the probe's length, which, as the product is not
-symmetric there, may exceed the eigenvalue, and tells of modes that two iterations would magnify at first.
+never more than the eigenvalue.
 
 The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
 in flexible cells; where kappa is large, in stiff ones, the equations are solved with the full mobility (`krylov`).
-One or two flexible flagella need little more than the least w and are measured rarely.
 """
 
 import functools
@@ -306,7 +306,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             # The growth of a probe of any direction may exceed kappa by far: stiff cells are solved with the full
             # mobility until their probe has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]
-            if flexible:
+            if weak:
                 kappa = quotient(model, state, stability, c, step[c], gain[c], over_implicit[c])
             most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
             stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
