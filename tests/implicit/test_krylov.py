@@ -86,7 +86,7 @@ def test_stiff_cells_keep_their_accuracy_in_long_steps(name, device):
 def test_a_flexible_cell_needs_no_krylov_space(device):
     sim = Simulation(paper_scene(name="flexible"), device=device)
     sim.advance(1e-4)
-    assert 1.0 < sim.stepper.stability.kappa.numpy()[0] < stability.LARGE_KAPPA
+    assert 0.5 < sim.stepper.stability.kappa.numpy()[0] < stability.LARGE_KAPPA
     assert not sim.stepper.stability.strong.numpy().any()
 
 

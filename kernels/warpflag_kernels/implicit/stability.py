@@ -6,14 +6,14 @@ over-implicitness w, a step of two iterations multiplies such a mode by (1 - kap
 kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
 product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
 
-kappa is taken to be the growth of the probe's length. The product is not symmetric, so that may exceed the eigenvalue; it
-tells of modes that two iterations would magnify at first. One or two flexible flagella need little more than the least w
-and are measured rarely; a probe that lags behind would grow too much then. There kappa is the Rayleigh quotient of the
-probe x in the inner product with H, in which both sides are symmetric: with the forces f = -H x,
+kappa is taken to be the growth of the probe's length. The product is not symmetric, so that may exceed the eigenvalue;
+it tells of modes that two iterations would magnify at first. One or two flexible flagella need little more than the
+least w and are measured rarely; a probe that lags behind would grow too much then. There kappa is the Rayleigh quotient
+of the probe x in the inner product with H, in which both sides are symmetric: with the forces f = -H x,
 
     kappa = w (x.H x/dt + g f.M f) / (x.H x/dt + w g f.D f),
 
-never more than the eigenvalue.
+never more than the eigenvalue, but for the small antisymmetric part of H.
 
 The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
 in flexible cells; where kappa is large, in stiff ones, the equations are solved with the full mobility (`krylov`).
@@ -30,7 +30,7 @@ import warp as wp
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body
-from warpflag_kernels.implicit import linearised
+from warpflag_kernels.implicit import block_band, linearised
 from warpflag_kernels.rod import chain_chart
 
 LEAST = 1.3  # least over-implicitness, enough for kappa up to 2.6
@@ -99,6 +99,7 @@ def allocate(model: DeviceModel) -> Any:
 def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     """The kernels; those of cells with flow round their bodies, or without."""
     real, vec3, respond = p.real, p.vec3, body.mobility(p).respond
+    Band = block_band.types(p).Band
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability", "body_flow" if body_flow else "")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
@@ -187,6 +188,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
+        band: Band,
         probe: Increment,
         # Out:
         stability: Stability,
@@ -215,7 +217,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             if e > first:
                 f = state.force[e]
                 across = model.drag.mobility_across[e]
-                along = wp.dot(f, state.pose.tangent[e])
+                along = wp.dot(f, band.tangent[e])
                 stored -= wp.dot(f, vec3(x[0], x[1], x[2]))
                 local += across * wp.dot(f, f) + (model.drag.mobility_along[e] - across) * along * along
                 full += wp.dot(f, state.velocity[e])
@@ -369,7 +371,7 @@ def measure(
     kernels, device = _kernels(model.precision, model.switches.flows.body), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
-    inputs = [model.data, state.data, stability.probe, stability]
+    inputs = [model.data, state.data, band, stability.probe, stability]
     wp.launch(kernels.dissipate, model.flagellum_count, inputs=inputs, device=device)
     linearised.solve(model, state, band, response)
     inputs = [model.data, response, stability]
