@@ -75,8 +75,13 @@ def _listen(stream: TextIO, requests: queue.Queue[dict[str, Any] | None]) -> Non
 
 
 def _answer(answers: TextIO, answer: dict[str, Any]) -> None:
-    answers.write(json.dumps(answer) + "\n")
-    answers.flush()
+    try:
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+    except BrokenPipeError:  # the sweep was killed: the end of the input, which comes as well, ends the batch in order
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, answers.fileno())
+        os.close(nowhere)
 
 
 def _run(request: dict[str, Any], answers: TextIO, stop: Stop) -> dict[str, Any]:
