@@ -29,7 +29,7 @@ __all__ = ["SUSPECT", "Run"]
 _CHECKPOINT_SECONDS = 5.0  # wall time between two checkpoints: what a killed run computes again
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05  # wall time between two copies of all cells, a hundredth of that between checkpoints
-_WRITERS = 8  # threads that write files: a disk takes many at once faster, and waits are most of it
+_WRITERS = 2  # threads that write files: one computes while the other waits for the disk; more wait for each other
 # Estimate of the worst window over the accuracy from which on a run is followed by disturbed copies (`growth`); windows
 # of sound zipping runs reach four.
 SUSPECT = 5.0
