@@ -83,6 +83,19 @@ def test_stiff_cells_keep_their_accuracy_in_long_steps(name, device):
     assert ends[1].step < 250
 
 
+def test_the_stiffest_cells_with_flow_round_the_body_keep_their_accuracy(device):
+    """f = 1e4, against a run of a thirtieth of the accuracy: the Krylov space is larger there."""
+    stiff = {"flagella.bending_rigidity": 3.5e4, "flagella.twist_rigidity": 3.5e4, "flagella.stretching_stiffness": 1e7}
+    around = {"hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": True, "flagella.length": 7.0}
+    scene, duration, accuracy = with_values(paper_scene(name="stiff"), {**stiff, **around}), 2e-4, 5e-3
+    ends = []
+    for asked in (accuracy / 30, accuracy):
+        sim = Simulation(with_values(scene, {"numerics.accuracy": asked}), device=device)
+        sim.advance(duration)
+        ends.append(sim.state.positions)
+    assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 2 * accuracy * (duration / 1e-3) ** 0.5
+
+
 def test_a_flexible_cell_needs_no_krylov_space(device):
     sim = Simulation(paper_scene(name="flexible"), device=device)
     sim.advance(1e-4)

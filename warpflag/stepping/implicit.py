@@ -130,7 +130,8 @@ class ImplicitStepper:
         if model.switches.pairs != "none":
             self.stability = stability.allocate(model)
             linearised.allocate(model, system.state)
-            self._krylov = krylov.allocate(model)
+            around = krylov.DIMENSION_AROUND_BODIES if model.switches.flows.body else krylov.DIMENSION
+            self._krylov = krylov.allocate(model, around)
         system.control.longest_step.assign([f or LONGEST_STEP for f in fixed])
         system.guard.interval.fill_(1)
         self.dense: DenseOutput | None = None

@@ -24,7 +24,8 @@ from warpflag_kernels.implicit import linearised
 from warpflag_kernels.implicit import stability as stability_stage
 from warpflag_kernels.rod import chain_chart
 
-DIMENSION = 6  # of the Krylov space; the stiffest free cell errs by 1.4 at 4, 1.1 at 6, 2.4 at 10 (docs/numerics.md)
+DIMENSION = 6  # of the Krylov space (docs/numerics.md)
+DIMENSION_AROUND_BODIES = 12  # of that of cells with flow round their bodies, whose modes are coupled more
 
 
 @functools.cache
