@@ -69,7 +69,7 @@ WINDOWS = {
     "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, whose contacts are forming
     "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
     # Three times the torque: contacts slam shut, steps are rejected.
-    "hard": Window(2, 2.0e-3, 5.0e-4, 3, (("motor.torque", 10.0),)),
+    "hard": Window(2, 2.0e-3, 2.0e-4, 3, (("motor.torque", 10.0),)),
     # A hundred times the steric force.
     "stiff": Window(2, 5.5e-3, 5.0e-4, 3, (("steric.strength", 80.0),)),
     # A hundred times the stretching stiffness.
@@ -114,10 +114,12 @@ DRIVER = "warpflag"
 
 CONSTANTS = {
     "collocation.THETA": Constant("implicit.collocation", (0.8, 0.72, 0.75, 0.85, 0.9, 1.0), (*TWO, "crowd", "taut")),
-    "collocation.ERROR_PER_PREDICTOR": Constant("implicit.collocation", (7.0, 2.0, 4.0, 10.0, 14.0), (*TWO, "crowd")),
+    "collocation.ERROR_PER_PREDICTOR": Constant("implicit.collocation", (3.5, 1.0, 2.0, 5.0, 7.0), (*TWO, "crowd")),
+    "collocation.BEGUN_WHOLE": Constant("implicit.collocation", (1.3, 0.0, 0.65, 1.0, 1.6), (*TWO, "crowd")),
     "collocation.GAP_SHARE": Constant("implicit.collocation", (0.1, 0.03, 0.05, 0.2, 0.35, 0.7), TOUCHING),
     "collocation.GAP_GROWTH": Constant("implicit.collocation", (4e9, 0.0, 1e9, 1.6e10, 6.4e10), TOUCHING, FIXED),
     "step_control.REJECTED": Constant("stepping.step_control", (5.0, 2.0, 3.0, 10.0, 25.0), (*UPSET, "contact")),
+    "accuracy.CORRELATION": Constant("stepping.accuracy", (5e-6, 1e-9, 2e-6, 1e-5, 2e-5), (*TWO, "crowd", "hard")),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
     "step_control.MEMORY": Constant("stepping.step_control", (20.0, 3.0, 8.0, 50.0, 1e3), (*TWO, "crowd", "hard")),
     "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
@@ -165,7 +167,7 @@ CONSTANTS = {
     ),
     "implicit.FIRST_TOLERANCE": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(
-        "stepping.implicit", (3e-5, 1e-5, 2e-5, 5e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 0.5),), package=DRIVER
+        "stepping.implicit", (5e-5, 2e-5, 3e-5, 7e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 0.5),), package=DRIVER
     ),
     "implicit.OVER_IMPLICIT_CROWD": Constant("stepping.implicit", (3.0, 1.3, 2.0, 5.0), ("crowd",), package=DRIVER),
 }
