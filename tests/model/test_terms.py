@@ -149,7 +149,7 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     loaded = set(re.findall(r"Module warpflag_kernels\.(\S+) \S+ load on", said))
     assert loaded == {
         "clock",
-        "rkc.float64.fast",
+        "rkc.float64.fast.cells",
         "reconstruction.float64.fast",
         "chart.float64.fast",
         "whole_cell.float64.fast.motor_elastic_bearing_none_none",

@@ -113,8 +113,10 @@ def test_the_checkpoint_of_another_run_is_refused(tmp_path):
 
 def test_a_setting_that_a_later_version_adds_leaves_runs_resumable(tmp_path, monkeypatch):
     directory = halved(tmp_path / "made")
+    run_directory._default_settings.cache_clear()
     monkeypatch.setattr(run_directory, "dumps", lambda scene: dumps(scene).replace("[steric]", "[steric]\nadded = 0.0"))
     assert run.resume(str(directory)).execute(quiet=True).status == "done"
+    run_directory._default_settings.cache_clear()
     assert_same_frames(executed(small(), tmp_path / "whole"), directory)
 
 
