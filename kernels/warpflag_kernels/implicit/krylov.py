@@ -3,9 +3,9 @@
 The matrix, inverse P, holds the local mobility; with the full one the equations are K x = b, K = D^-1 (1/dt + g M H).
 In stiff cells, where P K has eigenvalues far from 1 (`stability`), each of a step's two iterations solves P K x = P b
 in the Krylov space of P K and P b (Saad & Schultz, SIAM J. Sci. Stat. Comput. 7, 856 (1986)), `DIMENSION` products a
-solution, more where there is thermal noise. It does so after the contact solve, with the contact forces found there in
-b: forces balance as far as GMRES converges, and only the gaps are those that the matrix predicts, which the second
-iteration corrects.
+solution, more with flow round the body and where there is thermal noise. It does so after the contact solve, with the
+contact forces found there in b: forces balance as far as GMRES converges, and only the gaps are those that the matrix
+predicts, which the second iteration corrects.
 
 The inner product counts displacements in segment lengths, spins and the body's rotation in radians. A thread does a
 cell's sums: the cells that need it are few.

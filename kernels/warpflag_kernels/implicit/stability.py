@@ -13,7 +13,7 @@ of the probe x in the inner product with H, in which both sides are symmetric: w
 
     kappa = w (x.H x/dt + g f.M f) / (x.H x/dt + w g f.D f),
 
-never more than the eigenvalue, but for the small antisymmetric part of H.
+never more than the eigenvalue where H is positive and symmetric, and never taken to be more than the growth.
 
 The larger w, the more of every stiff mode a step leaves behind, which no error estimate sees. So w follows kappa only
 in flexible cells; where kappa is large, in stiff ones, the equations are solved with the full mobility (`krylov`).
@@ -246,7 +246,11 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             k += 1
         velocity, spin = respond(model, state, c, force, torque)
         local += wp.float64(wp.dot(force, velocity) + wp.dot(torque, spin))
-        return w * (stored / dt + g * full) / (stored / dt + w * g * local)
+        # In soft modes of a filament under load x.H x may be negative, and then no stiffness is to be had from it.
+        denominator = stored / dt + w * g * local
+        if denominator <= wp.float64(0.0):
+            return w
+        return w * (stored / dt + g * full) / denominator
 
     @wp.kernel(module=module)
     def measure(
@@ -309,7 +313,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             # mobility until their probe has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]
             if weak:
-                kappa = quotient(model, state, stability, c, step[c], gain[c], over_implicit[c])
+                kappa = wp.min(kappa, quotient(model, state, stability, c, step[c], gain[c], over_implicit[c]))
             most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
             stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
             if stability.strong[c] != 0:
