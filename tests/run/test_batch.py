@@ -49,6 +49,34 @@ def test_members_equal_their_single_runs_to_the_last_bit(stepper, device, precis
     assert (batch.times == 3.5e-5).all()
 
 
+@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
+def test_frames_of_a_member_are_those_of_its_single_run(stepper, device, precision):
+    """Members that differ in length, in their frames' interval, and so in how many frames a look at them finds."""
+    common = {"numerics.stepper": stepper, "duration": 4e-5}
+    scenes = [
+        touching_cell({"flagella.length": 1.6, "frames": 4, **common}, precision),
+        touching_cell({"frames": 16, **common}, precision),
+    ]
+    batch = Simulation(scenes, device=device)
+    found = {0: [], 1: []}
+    for until in (1.9e-5, 4e-5):
+        for frames in batch.cell_frames(until):
+            for c, frame in frames.items():
+                found[c].append(frame)
+    for c, scene in enumerate(scenes):
+        alone = Simulation(scene, device=device)
+        expected = [frame for until in (1.9e-5, 4e-5) for frame in alone.frames(until)]
+        assert len(expected) == len(found[c]) == scene.frames + 1
+        for one, other in zip(found[c], expected, strict=True):
+            assert (one.time, one.step) == (other.time, other.step)
+            assert np.array_equal(one.positions, other.positions)
+            assert one.observables.keys() == other.observables.keys()
+            for name, value in one.observables.items():
+                np.testing.assert_array_equal(value, other.observables[name], err_msg=name)
+        force = alone.cell_state().steric_force
+        assert force > 0.0 and expected[-1].observables["steric_force_density"] > 0.0
+
+
 def test_members_do_not_feel_each_other(device):
     """Two cells in the same place: no contact, no flow between them."""
     scene = cell()

@@ -114,6 +114,16 @@ def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path):
     assert_same_frames(whole, tmp_path / "halved")
 
 
+def test_a_duration_counts_from_where_the_cell_is():
+    parts, whole = (Simulation(small(), device="cpu") for _ in range(2))
+    for duration in (2e-5, 1e-5):
+        parts.run(duration)
+    for until in (2e-5, 2e-5 + 1e-5):
+        whole.advance(until)
+    assert parts.state.time == whole.state.time == 2e-5 + 1e-5
+    np.testing.assert_array_equal(parts.state.positions, whole.state.positions)
+
+
 class Listener:
     """A reporter that keeps what it is told."""
 
