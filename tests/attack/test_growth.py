@@ -72,8 +72,8 @@ def test_errors_of_steps_are_no_growth():
     assert found is not None and 0.1 < found.factor < 5.0
 
 
-def test_growth_at_a_known_rate_is_found(monkeypatch):
-    """Two cells that part at a rate that doubles their distance ten times in `SPAN`; looks are a tenth of it apart."""
+def parting(monkeypatch, scale):
+    """Pairs of cells are as far apart as `scale` says, of the time; returns the scenes they were made of."""
     made = []
 
     class Parting:
@@ -83,15 +83,34 @@ def test_growth_at_a_known_rate_is_found(monkeypatch):
 
         def advance(self, until, watch):
             watch()
-            self.scale = 2.0 ** (10.0 * until / SPAN)
+            self.scale = scale(until)
 
         def cells(self):
             return SimpleNamespace(positions=np.concatenate([self.one, self.one + self.scale * (self.two - self.one)]))
 
     monkeypatch.setattr("warpflag.run.growth.Simulation", Parting)
-    scene = small({"numerics.accuracy": 1e-3})
+    return made
+
+
+def still(time):
     nodes = np.zeros((22, 3))
-    state = SimpleNamespace(time=3e-4, positions=nodes, directors=nodes, body_position=nodes[0], body_orientation=None)
+    return SimpleNamespace(time=time, positions=nodes, directors=nodes, body_position=nodes[0], body_orientation=None)
+
+
+def test_the_largest_growth_is_told_of_all_looks_and_starts(monkeypatch):
+    """Pairs that part and meet again, farthest in the middle of `SPAN`."""
+    parting(monkeypatch, lambda until: 1.0 + 10.0 * np.sin(np.pi * until / SPAN))
+    found = growth(small(), [still(1e-4), still(2e-4)], np.array([0, 11, 22]), "cpu", 2e-7)
+    largest = np.linalg.norm(np.random.default_rng(0).standard_normal((10, 3)), axis=1).max() / 3**0.5
+    assert found is not None and not found.unstable
+    assert found.within == pytest.approx(SPAN / 2) and found.factor >= 11.0 * largest * (1 - 1e-9)
+    assert found.start == 1e-4
+
+
+def test_growth_at_a_known_rate_is_found(monkeypatch):
+    """Two cells that part at a rate that doubles their distance ten times in `SPAN`; looks are a tenth of it apart."""
+    made = parting(monkeypatch, lambda until: 2.0 ** (10.0 * until / SPAN))
+    scene, state = small({"numerics.accuracy": 1e-3}), still(3e-4)
     found = growth(scene, [state], np.array([0, 11, 22]), "cpu", 2e-7)
     largest = np.linalg.norm(np.random.default_rng(0).standard_normal((10, 3)), axis=1).max() / 3**0.5
     assert found is not None and found.unstable and found.start == 3e-4

@@ -69,17 +69,18 @@ def test_torque_and_rate_lie_on_the_curve_and_turn_the_body(finely, turned, prec
     assert np.abs(found.tangents[found.first] @ found.body_spin).max() > 1.0
 
 
-def test_without_load_a_motor_runs_at_the_end_of_its_curve(device):
+@pytest.mark.parametrize(("knee_back", "end"), [(0.0, None), (40.0, 150.0)])
+def test_without_load_a_motor_runs_at_the_end_of_its_curve(knee_back, end, device):
     """The tripod's own drag is a two-thousandth of the slope; in reverse the other curve holds, mirrored."""
-    scene = cell({**CURVE, "motor.switching": "schedule", "motor.switch_times": (0.0,), "motor.reverse_torque": 0.9})
-    for time, sign, stall in ((0.0, 1.0, 1.26), (1.0, -1.0, 0.9)):
+    reverse = {"motor.reverse_torque": 0.9, "motor.reverse_no_load": end, "motor.reverse_knee": knee_back}
+    scene = cell({**CURVE, "motor.switching": "schedule", "motor.switch_times": (0.0,), **reverse})
+    for time, sign, stall, knee, last in ((0.0, 1.0, 1.26, 100.0, 300.0), (1.0, -1.0, 0.9, knee_back, end or 300.0)):
         start = shaken(scene, seed=1, node=0.0, spin=0.0)
         sim = Simulation(scene, device=device, starts=start)
         sim.system.control.time.fill_(time)
         found = sim.evaluate()
-        assert rates(found) == pytest.approx(sign * 300.0, rel=2e-3)
-        knee = 100.0 if sign > 0 else 0.0
-        assert found.motor_torques == pytest.approx(sign * on_curve(stall, knee, 300.0, sign * rates(found)), abs=1e-9)
+        assert rates(found) == pytest.approx(sign * last, rel=2e-3)
+        assert found.motor_torques == pytest.approx(sign * on_curve(stall, knee, last, sign * rates(found)), abs=1e-9)
 
 
 def test_reversed_motors_are_mirrored(device):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ import pytest
 from tests.runs import small
 from warpflag.run.check import report
 from warpflag.run.check.left_out import EFFECTS, left_out
+from warpflag.run.check.noise import of_noise
 from warpflag.run.check.polymorphs import of_polymorphs
 from warpflag.run.check.rigid import mesh_dependence, turning
-from warpflag.run.check.time_needed import Needed
+from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
 
 
@@ -29,6 +32,73 @@ def test_an_effect_that_the_scene_has_is_not_told():
         assert not any(line.startswith(word) for line in lines(**{key: 0.05}))
     assert not any("lubrication" in line for line in lines(flagella__count=1))
     assert not any("hook length" in line for line in lines(body__contact=False))
+
+
+def told(word: str, **values) -> float:
+    """The number that the line of an effect tells before or after a word."""
+    (found,) = [number for line in lines(**values) if (number := re.search(word, line))]
+    return float(found[1])
+
+
+def test_sizes_of_what_is_left_out_are_those_of_theory():
+    """To the digits told; a straight filament, or numbers chosen so that the answer is round."""
+    straight = {"flagella__intrinsic_curvature": (0.0, 0.0, 0.0), "flagella__length": 2.0}
+    assert told(r"at rest are (\d+) sigma", flagella__helix_radius=0.2, flagella__helix_pitch=1.6) == 40
+    assert told(r"is ([\d.]+) of the torque", motor__torque=1.3) == 0.5
+    # A segment of 0.2 um that rises to 0.9 sigma over its length.
+    assert told(r"by about (\d+) degrees") == round(math.degrees(math.asin(0.9 * 0.04 / 0.2)))
+    assert told(r"are ([\d.]+) filament radii", steric__diameter=0.025) == 0.5
+    assert any("0.5 filament radii apart; not small" in line for line in lines(steric__diameter=0.025))
+    # Clamped rod in equilibrium: kT L^3/(3 A) in each of two directions.
+    rest = math.sqrt(2 * 1.380649e-23 * 298.0 * 1e18 * 2.0**3 / (3 * 3.5))
+    assert told(r"tips by about ([\d.]+) um", **straight, duration=10.0, frames=1) == pytest.approx(rest, rel=0.05)
+    # SI: density of water 1000 kg/m^3, viscosity 1e-3 Pa s.
+    stiff = turning(small())
+    number = 1e3 * stiff.tip_speed * 1e-6 * stiff.radius * 1e-6 / 1e-3
+    assert told(r"Reynolds number (\S+)") == pytest.approx(number, rel=0.5) and stiff.tip_speed > 0.0
+    # The body's Stokeslet along its axis, 3/2 a/r of its speed, from where flagella begin; a sphere's a is its radius.
+    sphere = {"body__length": 0.8, "body__width": 0.8, "flagella__anchor_offset": 0.0}
+    far = turning(small()).axial_length + 0.4
+    mean = np.mean(1.5 * 0.4 / np.linspace(0.4, far, 10001))
+    assert told(r"about (\d+) % of the swimming speed", **sphere) == pytest.approx(100 * mean, abs=1.0)
+
+
+def test_noise_turns_a_filament_as_rotational_diffusion_does():
+    """A straight rod about its end in two directions: <x^2> = 4 kT t L^2/(gamma L^3/3)."""
+    values = {"flagella.intrinsic_curvature": (0.0, 0.0, 0.0), "fluid.temperature": 298.0, "duration": 1e-3}
+    scene = small({**values, "motor.bearing_torque": True, "hydrodynamics.mode": "none", "flagella.length": 3.0})
+    (_, said) = of_noise(scene, 1e-6)
+    energy = 1.380649e-23 * 298.0 * 1e18  # pN um
+    tip = math.sqrt(4 * energy * 1e-3 * 3.0**2 / (2.8e-3 * 3.0**3 / 3))
+    found = re.search(r"tip by about ([\d.]+) um in 1 ms, ([\d.e-]+) um in a step", said)
+    assert found is not None and float(found[1]) == pytest.approx(tip, rel=0.05)
+    assert float(found[2]) == pytest.approx(tip * math.sqrt(1e-3), rel=0.5)
+    assert of_noise(small(), 1e-6) == []
+
+
+@pytest.mark.parametrize("duration", [2e-4, 2e-3, 0.5])
+def test_the_time_of_stepping_is_told_by_the_speed_of_a_sample(duration, monkeypatch):
+    """Of a cell that takes 1 s for the start, and then 2 s for a simulated millisecond."""
+    clock, scene = [0.0], small({"duration": duration, "frames": 10})
+
+    class Steady:
+        scenes, first_node, time = (scene,), np.array([0, 3]), 0.0
+
+        def prepare(self, recording):
+            clock[0] += 1.0
+
+        def advance(self, until):
+            clock[0] += 2e3 * (until - self.time)
+            self.time = until
+
+        def cell_state(self):
+            nodes = np.arange(9.0).reshape(3, 3)
+            return SimpleNamespace(positions=nodes, directors=nodes, steric_force=0.0)
+
+    monkeypatch.setattr("warpflag.run.check.time_needed.time", SimpleNamespace(process_time=lambda: clock[0]))
+    found = needed(Steady())
+    assert found.startup == 1.0 and found.compiling == 0.0
+    assert found.stepping == pytest.approx(2e3 * duration) and found.sampled == pytest.approx(clock[0] - 1.0)
 
 
 def test_a_stiff_helix_turns_as_resistive_force_theory_says():
@@ -58,8 +128,8 @@ def test_the_mesh_error_is_told_within_a_factor_of_two(mode, length, torque):
         angle = sim.state.motor_angle[0]
         sim.advance(3e-3)
         rates.append(sim.state.motor_angle[0] - angle)
-    told = mesh_dependence(small({**values, "flagella.segment_length": 0.3}), 0.5)
-    assert told is not None and 0.5 < told / (rates[0] / rates[1] - 1) < 2.0
+    said = mesh_dependence(small({**values, "flagella.segment_length": 0.3}), 0.5)
+    assert said is not None and 0.5 < said / (rates[0] / rates[1] - 1) < 2.0
 
 
 def test_the_time_is_a_range_of_its_parts():

@@ -228,6 +228,14 @@ def test_a_finished_run_can_be_prolonged(tmp_path):
         assert record.scene_text == dumps(small())
 
 
+def test_a_multiple_of_the_frame_interval_that_rounds_down_is_one(tmp_path):
+    """7e-5 over 1e-5 is 6.999... in float64."""
+    short = executed(small({"duration": 4e-5, "frames": 4}), tmp_path / "short")
+    assert run.resume(str(short), ["duration=7e-5"]).execute(quiet=True).status == "done"
+    with Record(short) as record:
+        assert record.times == pytest.approx(1e-5 * np.arange(8))
+
+
 @pytest.mark.parametrize(
     "override, words",
     [

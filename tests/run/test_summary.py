@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from warpflag_kernels.stepping import accuracy
+
 from tests.runs import executed, small, summary
-from warpflag.run.summary import digest, plain
+from warpflag.run.summary import accuracy_kept, digest, kept_words, plain
 
 TIMES = 1e-3 * np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 8.0])
 
@@ -75,6 +77,31 @@ def test_last_observables_and_counts():
 def test_what_is_not_finite_is_none_in_a_file():
     values = {"a": np.nan, "b": [np.inf, 1.0], "c": np.array([2.0, -np.inf]), "d": np.float32(0.5), "e": np.int64(3)}
     assert plain(values) == {"a": None, "b": [None, 1.0], "c": [2.0, None], "d": 0.5, "e": 3}
+
+
+def kept(**sums: float) -> dict[str, Any]:
+    """What a summary says of a run of 3 ms at 5e-3 um/ms whose sums these are."""
+    given = dict.fromkeys((*accuracy.SUMS, "at_shortest"), 0.0) | sums
+    arrays = {f"stepper.achieved_{name}": np.array([value]) for name, value in given.items()}
+    return accuracy_kept(small({"numerics.stepper": "rkc"}), arrays | {"control.time": np.array([3e-3])})
+
+
+def test_the_worst_window_ends_where_it_was_or_where_the_run_is():
+    ended = {"total": 3e-3, "total_time": 3e-3, "worst": 4.0, "worst_end": 1.7e-3}
+    assert (kept(**ended)["worst_window"], kept(**ended)["worst_window_end"]) == pytest.approx((2e-2, 1.7e-3))
+    found = kept(**ended, window=6e-4, window_time=1e-4)  # the present one is worse
+    assert (found["worst_window"], found["worst_window_end"]) == pytest.approx((3e-2, 3e-3))
+    assert found["estimate"] == pytest.approx(5e-3)
+
+
+def test_the_last_line_tells_of_a_window_that_stands_out():
+    facts = {"asked": 5e-3, "estimate": 1e-3, "worst_window": 1.5e-2, "worst_window_end": 2.5e-3}
+    facts |= {"steps_at_shortest": 0}
+    said = "error estimate 0.2 times the 0.005 um/ms asked for"
+    assert kept_words(facts) == f"{said} (worst 3 times, just before 2.5 ms)"
+    assert kept_words(facts | {"worst_window": 9e-3}) == said  # below twice what was asked
+    assert "worst" not in kept_words(facts | {"estimate": 8e-3})  # below twice the mean
+    assert kept_words(facts | {"steps_at_shortest": 7}).endswith(", 7 steps as short as estimates may ask for")
 
 
 def test_refused_steps_are_counted_once(tmp_path):

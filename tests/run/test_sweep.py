@@ -92,6 +92,11 @@ def test_the_size_of_batches_follows_what_was_measured():
     assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
     assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
     assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
+    # A member takes 0.1 s of its own, and a batch 0.2 s once: alone 0.3, in a batch of 8 0.125 s.
+    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=64)
+    assert (size, seconds) == pytest.approx((64, 64 * 0.1 + 0.2))
+    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=16)
+    assert (size, seconds) == pytest.approx((16, 64 * 0.1 + 4 * 0.2))
     size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
     assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
 
