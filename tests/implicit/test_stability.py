@@ -7,7 +7,8 @@ import pytest
 from warpflag_kernels.implicit import stability
 
 from tests.bench import Bench, bench, dense_solver, flat
-from tests.helpers import shaken, touching_cell
+from tests.helpers import cell, shaken, touching_cell
+from warpflag.run.simulation import Simulation
 
 # Of kappa, relative.
 TOLERANCE = {"float64": 1e-3, "float32": 5e-3}
@@ -105,3 +106,36 @@ def test_two_flexible_flagella_are_measured_from_below(device, precision):
     last, chosen = looked(b, 400)
     assert last == pytest.approx(largest, rel=0.015)  # H has a small antisymmetric part
     assert chosen == pytest.approx(max(0.6 * last, 0.985 * WEIGHT), rel=1e-6)
+
+
+def largest_root(r: float, share: float, theta: float = 0.8) -> float:
+    """Of a stiff mode in equal steps, of which two iterations leave r of what is not known when they begin.
+
+    q_n+1 = q_n + d_n - (1 - r)/rho (q_n + theta d_n) + r share (d_n - d_n-1), d_n = q_n - q_n-1.
+    """
+    rho = theta * (1 - (1 - theta) / 2)
+    pull, known = (1 - r) / rho, r * share
+    return float(np.abs(np.roots([1.0, pull * (1 + theta) - 2 - known, 1 - pull * theta + 2 * known, -known])).max())
+
+
+def test_a_step_begins_with_no_more_than_keeps_slow_modes_damped(device, precision):
+    """Neighbours that move against each other have 0.56 of the local mobility at least."""
+    sim = Simulation(cell({"numerics.stepper": "implicit"}, precision), device=device, capture=False)
+    sim.advance(2e-5)
+    data, begun = sim.stepper.data, {}
+    sim.system.control.target.fill_(1e-3)
+    for w in (1.0, 1.3, 1.6, 2.1, 3.0, 5.0):
+        sim.system.state.data.active.fill_(1)
+        data.over_implicit.fill_(w)
+        data.share.fill_(1.0)
+        sim.stepper.launch_pass()
+        begun[w] = float(data.begun.numpy()[0])
+        assert float(data.awaited.numpy()[0]) + begun[w] == pytest.approx(1.0)  # gaps are predicted with the rest
+        assert largest_root((1 - 0.56 / w) ** 2, begun[w]) < 0.905, w
+    assert begun[1.0] == begun[1.3] == 1.0
+    data.share.fill_(0.5)
+    sim.system.state.data.active.fill_(1)
+    data.over_implicit.fill_(2.6)
+    sim.stepper.launch_pass()
+    assert float(data.begun.numpy()[0]) == pytest.approx(0.5 / 4)
+    assert largest_root(0.42, 1.0) > 0.95  # as in the table of docs/numerics.md

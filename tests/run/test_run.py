@@ -5,11 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from warpflag_kernels.stepping.health import Fault
 
 from tests.runs import arrays, executed, frame_by_frame, small, summary
 from warpflag import observables
 from warpflag.record import Record
 from warpflag.run import run
+from warpflag.run.faults import NumericalError, likely_causes
 from warpflag.scene import dumps, load
 
 
@@ -83,3 +85,20 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
         assert said["frames"] == record.frame_count >= 4
         sound = executed(scene, tmp_path / "sound")
         np.testing.assert_array_equal(record.positions[:4], arrays(sound)["positions"][:4])
+
+
+def test_likely_causes_are_told_the_farthest_from_usual_first():
+    assert likely_causes(small()) == likely_causes(small({"fluid.viscosity": 2e-3})) == []  # factors of two are ordinary
+    pulled = {"external.body_force": (0.0, 0.0, 1.0)}
+    far = small({"motor.torque": 34.0, "flagella.bending_rigidity": 350.0, "fluid.viscosity": 2e-3, **pulled})
+    causes = [
+        "flagella.bending_rigidity = 350, 100 times the default",
+        "motor.torque = 34, 10 times the default",
+        "external.body_force = (0.0, 0.0, 1.0)",
+    ]
+    assert likely_causes(far) == causes
+    (soft,) = likely_causes(small({"flagella.stretching_stiffness": 10.0}))
+    assert soft == "flagella.stretching_stiffness = 10, 1/100 of the default"
+    line = str(NumericalError(Fault.STRAIN, 2e-3, 0, 1, 4, far))
+    assert "flagellum 1, segment 4: a segment is stretched" in line and "stopped at 2 ms" in line
+    assert f"; likely cause: {causes[0]}, {causes[1]}; take a lower motor.torque" in line  # two at most
