@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from warpflag_kernels.stepping import balance
 from warpflag_kernels.stepping.health import Fault
 
-from tests.helpers import cell, touching_cell
+from tests.helpers import cell, free_nodes, touching_cell
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import paper_scene, with_values
 
@@ -34,6 +35,23 @@ def test_energy_and_work_of_a_step_are_those_of_the_cell(device, precision):
         assert sums(sim, "energy") == pytest.approx(energy, rel=TOLERANCE[precision])
         assert sim.stepper.balance.stored.numpy()[0] == pytest.approx(energy, rel=TOLERANCE[precision])
     assert sums(sim, "refused") == 0
+
+
+def test_the_power_of_a_pose_is_that_of_all_forces_on_all_velocities(device, precision):
+    """A small body, which motors turn fast: its turning is a tenth of all."""
+    small = {"body.length": 0.5, "body.width": 0.4, "flagella.anchor_offset": 0.0, "motor.bearing_torque": True}
+    scene = cell({**small, "numerics.stepper": "implicit", "external.body_force": (1.0, 0.0, 2.0)}, precision)
+    sim = Simulation(scene, device=device)
+    sim.advance(2e-5)
+    found, nodes = sim.evaluate(), free_nodes(scene)
+    sim.system.state.data.active.fill_(1)
+    balance.gather(sim.system.model, sim.system.state, sim.stepper.balance)
+    turning = float(found.body_torque @ found.body_spin)
+    power = float((found.forces[nodes] * found.velocities[nodes]).sum() + found.torques @ found.spins)
+    power += float(found.body_force @ found.body_velocity) + turning
+    assert sums(sim, "power") == pytest.approx(power, rel=TOLERANCE[precision]) and turning > 0.02 * power
+    load = np.linalg.norm(found.forces[nodes], axis=1).sum()
+    assert sums(sim, "load") == pytest.approx(load, rel=TOLERANCE[precision])
 
 
 @pytest.mark.parametrize("values", [{}, {"motor.bearing_torque": True}, {"external.body_force": (0.0, 3.0, 1.0)}])
