@@ -88,6 +88,29 @@ def test_who_is_measured_and_when(device, precision):
     assert bench({"hydrodynamics.mode": "none"}, precision, device).stepper.stability is None
 
 
+def rayleigh(probe: np.ndarray, hessian: np.ndarray, mobility: np.ndarray, local: np.ndarray) -> float:
+    """In the inner product with H, with the mobility and with the local one."""
+    forces = -hessian @ probe
+    stored = probe @ hessian @ probe / STEP
+    return WEIGHT * (stored + GAIN * forces @ mobility @ forces) / (stored + WEIGHT * GAIN * forces @ local @ forces)
+
+
+def test_the_quotient_has_the_body_moved_by_all_flagella(device, precision):
+    """A small body, and a probe in which it moves alone: its part is large, and flagella pull it together."""
+    values = {**LONG, "body.length": 0.5, "body.width": 0.4, "flagella.anchor_offset": 0.0}
+    exact, b = (bench(values, p, device) for p in ("float64", precision))
+    exact.factorise(STEP, WEIGHT * GAIN)
+    hessian, mobility, local = exact.hessian(), exact.mobility(), exact.mobility("none")
+    own = b.stepper.stability
+    own.probe.node.zero_()
+    own.probe.body.assign(np.array([[1.0, -0.7, 0.4, 0.5, 0.9, -0.6]]))
+    quotient = rayleigh(flat(own.probe), hessian, mobility, local)
+    still = local.copy()
+    still[:6] = 0.0
+    assert abs(rayleigh(flat(own.probe), hessian, mobility, still) / quotient - 1) > 0.02
+    assert looked(b, 1)[0] == pytest.approx(quotient, rel=TOLERANCE[precision])
+
+
 def test_two_flexible_flagella_are_measured_from_below(device, precision):
     """By the Rayleigh quotient of the probe, whatever its direction; it rises to the largest eigenvalue."""
     exact, b = (bench(LONG, p, device) for p in ("float64", precision))
@@ -95,12 +118,8 @@ def test_two_flexible_flagella_are_measured_from_below(device, precision):
     hessian, mobility, local = exact.hessian(), exact.mobility(), exact.mobility("none")
     full = np.eye(6 + 4 * b.count) / STEP + GAIN * mobility @ hessian
     largest = np.linalg.eigvals(WEIGHT * dense_solver(exact, STEP, WEIGHT * GAIN) @ full).real.max()
-    probe = flat(b.stepper.stability.probe)
-    forces = -hessian @ probe
-    stored = probe @ hessian @ probe / STEP
-    quotient = stored + GAIN * forces @ mobility @ forces
-    quotient *= WEIGHT / (stored + WEIGHT * GAIN * forces @ local @ forces)
     first, _ = looked(b, 1)
+    quotient = rayleigh(flat(bench(LONG, precision, device).stepper.stability.probe), hessian, mobility, local)
     assert first == pytest.approx(quotient, rel=TOLERANCE[precision]) and first < 0.9 * largest
     assert not b.stepper.stability.strong.numpy().any()
     last, chosen = looked(b, 400)

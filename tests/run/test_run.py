@@ -88,7 +88,7 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
 
 
 def test_likely_causes_are_told_the_farthest_from_usual_first():
-    assert likely_causes(small()) == likely_causes(small({"fluid.viscosity": 2e-3})) == []  # factors of two are ordinary
+    assert likely_causes(small()) == likely_causes(small({"fluid.viscosity": 2e-3})) == []  # twice is ordinary
     pulled = {"external.body_force": (0.0, 0.0, 1.0)}
     far = small({"motor.torque": 34.0, "flagella.bending_rigidity": 350.0, "fluid.viscosity": 2e-3, **pulled})
     causes = [

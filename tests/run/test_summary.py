@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from warpflag_kernels.stepping import accuracy
 
 from tests.runs import executed, small, summary

@@ -83,6 +83,22 @@ def test_draws_belong_to_points_and_spreads_to_repeats(folder):
     assert [m.scene.fluid.viscosity for m in more] == [m.scene.fluid.viscosity for m in found]
 
 
+@pytest.mark.parametrize(
+    "section, values",
+    [
+        ("motor", 'motor.switching = "markov"'),
+        ("fluid", 'fluid.temperature = 298.0\nmotor.bearing_torque = true\nhydrodynamics.mode = "none"'),
+    ],
+)
+def test_every_draw_and_repeat_has_random_numbers_of_its_own(section, values, folder):
+    """All but the first, which has the base's; the same at other values of an axis."""
+    text = f"repeats = 2\n[set]\n{values}\n{section}.seed = 7\n[axes]\nmotor.torque = [2.0, 3.0]\n[random]\ndraws = 3\n"
+    text += "flagella.length = {low = 2.0, high = 2.0}\n"
+    seeds = np.array([getattr(m.scene, section).seed for m in members(folder, text)]).reshape(2, 6)
+    assert seeds[0, 0] == 7 and len(set(seeds[0])) == 6
+    np.testing.assert_array_equal(seeds[0], seeds[1])
+
+
 def test_normal_spreads_have_their_mean_and_deviation(folder):
     text = "[set]\nflagella.count = 400\nsteric.enabled = false\n[random]\n"
     text += "flagellum.torque = {mean = 3.0, deviation = 0.3}\n"
@@ -107,6 +123,20 @@ def test_random_anchors_keep_their_distances(folder):
         shapes = [nodes[1:] for nodes in initial_state(member.scene).positions]
         for a, b in combinations(shapes, 2):
             assert np.linalg.norm(a[:, None] - b, axis=-1).min() >= 0.12
+
+
+def test_random_anchors_keep_their_distance_all_round_the_body(folder):
+    """On a ring, where the arc between two anchors may lead through azimuth 0."""
+    text = (
+        "repeats = 20\n[set]\nflagella.count = 5\n[random]\nseed = 1\n"
+        "anchors = {placement = 'random', least_distance = 0.3, clearance = 0.0, from = 0.0, to = 0.0}\n"
+    )
+    gaps = []
+    for member in members(folder, text):
+        azimuths = np.sort([own.azimuth for own in member.scene.flagellum])
+        gaps.append(np.radians(np.diff([*azimuths, azimuths[0] + 360.0])) * member.scene.body.width / 2)
+    assert np.min(gaps) >= 0.3
+    assert np.min(np.array(gaps)[:, -1]) < 0.5  # some came near over azimuth 0
 
 
 def test_even_and_given_anchors(folder):
