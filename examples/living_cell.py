@@ -1,10 +1,11 @@
-"""Pictures of docs/living-cell.md: a cell that runs and tumbles, a filament that changes form, unequal motors.
+"""Pictures of docs/living-cell.md: runs and tumbles, a filament that changes form, one that wraps, unequal motors.
 
     warpflag run examples/run_and_tumble.toml
     warpflag run examples/reversal.toml
+    warpflag run examples/wrapped.toml
     uv run --extra plot examples/living_cell.py [--runs runs] [-o DIR]
 
-Takes the records of the two runs and simulates the third itself, at several torques of the second motor, in 10 s.
+Takes the records of the three runs and simulates the last itself, at several torques of the second motor, in 10 s.
 """
 
 import argparse
@@ -13,11 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from warpflag import Record, Simulation
-from warpflag.scene import load, with_values
+from warpflag.base.rotations import matrix
+from warpflag.scene import load, loads, with_values
 from warpflag.view.coloring import FORM_COLORS
 
 HERE = Path(__file__).parent
 SMOOTHING = 0.05  # s, longer than a turn of the body
+MOMENTS = (0.0, 0.007, 0.009, 0.012, 0.016, 0.06)  # s, of the pictures of a filament that wraps
 TORQUES = (3.4, 3.2, 3.0, 2.7, 2.0)  # of the second motor [pN um]; the first has 3.4
 
 options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -32,11 +35,13 @@ def pyplot():
 
     matplotlib.use("Agg")
     import matplotlib.pyplot
+    from matplotlib.colors import to_rgb
+    from matplotlib.patches import FancyBboxPatch
 
-    return matplotlib.pyplot
+    return matplotlib.pyplot, FancyBboxPatch, to_rgb
 
 
-plt = pyplot()
+plt, FancyBboxPatch, to_rgb = pyplot()
 
 
 def save(figure, name: str) -> None:
@@ -93,6 +98,35 @@ def reversal() -> None:
     save(figure, "reversal")
 
 
+def wrapped() -> None:
+    """Body and filament in the body's axes, at some moments; what is behind the body is pale, or hidden by it."""
+    with Record(options.runs / "wrapped") as record:
+        size, wraps, forms = loads(record.scene_text).body, record.wrapping(), record.forms
+        assert forms is not None
+        seen = []
+        for moment in MOMENTS:
+            k = int(np.argmin(np.abs(record.times - moment)))
+            nodes = (record.positions[k] - record.body_position[k]) @ matrix(record.body_orientation[k])
+            title = f"{1e3 * record.times[k]:.0f} ms, {abs(wraps.turns[k, 0]):.1f} turns"
+            seen.append((nodes, forms[k], title))
+    figure, panels = plt.subplots(3, 2, figsize=(9, 5.4), layout="constrained", sharex=True, sharey=True)
+    cap = size.width / 2
+    outline = {"boxstyle": f"round,pad=0,rounding_size={cap}", "fc": "#e8d9b8", "ec": "#8a7a50", "zorder": 2}
+    for axes, (nodes, form, title) in zip(panels.flat, seen, strict=True):
+        axes.add_patch(FancyBboxPatch((-size.length / 2, -cap), size.length, 2 * cap, **outline))
+        for i in range(len(nodes) - 1):
+            behind = nodes[i : i + 2, 0].mean() < 0
+            color = 1.0 - (0.45 if behind else 1.0) * (1.0 - np.array(to_rgb(FORM_COLORS[form[i]])))
+            axes.plot(*nodes[i : i + 2, [2, 1]].T, color=color, lw=2.5, zorder=1 if behind else 3)
+        axes.set(title=title, aspect="equal", xlim=(-1.6, 7.4), ylim=(-1.4, 1.4))
+    for axes in panels[-1]:
+        axes.set_xlabel("µm along the body")
+    for name, color in zip(("normal", "coiled"), FORM_COLORS, strict=False):
+        panels[0, 1].plot([], [], color=color, lw=2.5, label=name)
+    panels[0, 1].legend(fontsize=8, frameon=False, loc="lower right")
+    save(figure, "wrapped")
+
+
 def unequal_motors() -> None:
     """Turns by which the second motor lags, and bundle length, over time."""
     figure, (above, below) = plt.subplots(2, sharex=True, figsize=(7, 4.4), layout="constrained")
@@ -113,4 +147,5 @@ def unequal_motors() -> None:
 
 run_and_tumble()
 reversal()
+wrapped()
 unequal_motors()

@@ -4,7 +4,8 @@
     uv run --extra plot examples/behaviour/cells.py runs/cells -o cells.png
 
 Runs and tumbles are those of `Record.runs_and_tumbles`; durations are of those that neither begin nor end with
-the record; errors are standard errors of the mean, of shares and speeds over cells.
+the record, and, with "all counted", the time of all over the number of ends, as of exponential distributions; errors
+are standard errors of the mean, of shares and speeds over cells.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from warpflag import Record
+from warpflag.observables.behaviour import exponential_mean
 from warpflag.record import RecordError
 
 options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -42,6 +44,10 @@ def of_cell(path: Path) -> dict[str, np.ndarray]:
         "angle, two or three": angle[motors[known] >= 2],
         "tumble": found.tumble_durations,
         "run": found.run_durations,
+        "runs": np.diff(found.runs, axis=1)[:, 0],
+        "runs ended": found.run_ended,
+        "tumbles": np.diff(found.tumbles, axis=1)[:, 0],
+        "tumbles ended": found.tumble_ended,
         "speed": np.array([found.run_speed]),
         "tumbling": np.array([found.tumbling_fraction]),
         "reverse": np.array([reverse.mean()]),
@@ -78,6 +84,10 @@ for name, unit in (
     error = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
     median = np.median(own) if len(own) else np.nan
     print(f"{name:21s} {own.mean():8.3g} +- {error:<8.2g} median {median:<8.3g} {len(own):4d} values  {unit}")
+for name in ("run", "tumble"):
+    mean, error = exponential_mean(values[f"{name}s"], values[f"{name}s ended"])
+    ends = int(values[f"{name}s ended"].sum())
+    print(f"{name + ', all counted':21s} {mean:8.3g} +- {error:<8.2g} {'':15s} {ends:4d} ends    s")
 
 
 def draw() -> None:

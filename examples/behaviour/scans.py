@@ -1,9 +1,11 @@
-"""Speeds and rates beside two experiments: against the number of flagella, and against body length with the number.
+"""Speeds and rates against the number of flagella, body length with the number, and viscosity with the number.
 
-    uv run examples/behaviour/scans.py [number] [length] [--duration 0.1]
+    uv run examples/behaviour/scans.py [number] [length] [viscosity] [--duration 0.1]
 
 number: 2, 5 and 8 flagella on one body, beside Lisevich et al. 2024 (2.12, 4.76, 7.57 flagella a cell).
 length: bodies of 2 to 6 um with 2 to 6 flagella, beside Kamdar et al. 2023 (speed independent of body length).
+viscosity: 1 to 8 flagella in 1, 2, 4 and 8 times the viscosity of water, beside Tatulea-Codrean & Lauga 2024 (a speed
+    that peaks at a number of flagella, and at more flagella in a more viscous fluid).
 Flagella of 7.5 um begin bundled at the rear pole; motors on the 175/300 Hz curve with a stall of 1.26 pN um; format 1.
 A minute of one core. Means over the second half of each run. Units: um, pN, s.
 """
@@ -21,14 +23,14 @@ options.add_argument("--duration", type=float, default=0.1, help="of each run [s
 options.add_argument("--accuracy", default="standard", help="numerics.accuracy")
 options = options.parse_args()
 
-CELLS = {
-    "number": [(2, 2.5), (5, 2.5), (8, 2.5)],
-    "length": [(2, 2.0), (3, 3.0), (4, 4.0), (5, 5.0), (6, 6.0)],
+CELLS = {  # flagella, body length [um], viscosity over that of water, and what was measured or calculated elsewhere
+    "number": [(2, 2.5, 1, "22.4, body 30"), (5, 2.5, 1, "26.6, body 37"), (8, 2.5, 1, "24.7, body 38")],
+    "length": [(number, float(number), 1, "the same speed for all") for number in (2, 3, 4, 5, 6)],
+    "viscosity": [(number, 2.5, viscosity, "") for viscosity in (1, 2, 4, 8) for number in (1, 2, 3, 4, 6, 8)],
 }
-MEASURED = {"number": ["22.4, body 30", "26.6, body 37", "24.7, body 38"], "length": ["the same for all"] * 5}
 
 
-def means(count: int, length: float) -> list[float]:
+def means(count: int, length: float, viscosity: float) -> list[float]:
     """Speed [um/s], motor rate [Hz], filament rate in the lab [Hz], body rate [Hz], torque [pN um], l_r."""
     values = {
         "duration": options.duration,
@@ -39,6 +41,7 @@ def means(count: int, length: float) -> list[float]:
         "flagella.anchor_offset": length / 2 - 0.05,
         "flagella.on_axis": True,
         "body.length": length,
+        "fluid.viscosity": 1e-3 * viscosity,
         "motor.axis_angle": 0.0,
         "motor.law": "torque_speed",
         "motor.torque": 1.26,
@@ -57,9 +60,10 @@ def means(count: int, length: float) -> list[float]:
 
 
 for scan in options.scans:
-    print(f"{scan}\n  N  body um  um/s  motor Hz  filament Hz  body Hz  pN um   l_r   s of CPU  measured")
-    for (count, length), measured in zip(CELLS[scan], MEASURED[scan], strict=True):
+    print(f"{scan}\n  N  body um  viscosity  um/s  motor Hz  filament Hz  body Hz  pN um   l_r   s of CPU  elsewhere")
+    for count, length, viscosity, elsewhere in CELLS[scan]:
         began = time.process_time()
-        row = means(count, length)
+        row = means(count, length, viscosity)
         text = "{:6.1f} {:8.0f} {:11.0f} {:9.0f} {:7.2f} {:6.2f}".format(*row)
-        print(f"{count:3d} {length:8.1f} {text} {time.process_time() - began:9.0f}    {measured}", flush=True)
+        cost = time.process_time() - began
+        print(f"{count:3d} {length:8.1f} {viscosity:10g} {text} {cost:9.0f}    {elsewhere}", flush=True)

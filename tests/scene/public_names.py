@@ -69,4 +69,5 @@ def run(made: Scene, directory: Path) -> float:
     with Record(directory) as record:
         found = record.wobble()
         print(record.motor_loads(), record.bundle_membership(), found.angle, record.frame(-1).time)
+        print(record.wrapping().wrapped)
         return float(record.observables["phase_difference"][-1])

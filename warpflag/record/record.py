@@ -75,6 +75,7 @@ class Record:
     runs_and_tumbles = method_from(_BEHAVIOUR, "runs_and_tumbles", "Runs and tumbles of the body's path.")
     bundle_membership = method_from(_BEHAVIOUR, "bundle_membership", "The bundle of every flagellum in every frame.")
     wobble = method_from(_BEHAVIOUR, "wobble", "Precession and nutation of the body's axis, or the bundle's.")
+    wrapping = method_from(_BEHAVIOUR, "wrapping", "How far each flagellum is wrapped round the body in every frame.")
     motor_loads = method_from(_BEHAVIOUR, "motor_loads", "Rate, torque and drag at which each motor works.")
     _repr_html_ = method_from("warpflag.view.page", "notebook_frame", "The page of the record, as a notebook shows it.")
 

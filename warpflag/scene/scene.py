@@ -89,7 +89,7 @@ class Scene(Section, key=""):
     )
     duration: float = number(0.015, "s", 1e-12, 10, "simulated time")
     frames: int = integer(300, 1, 10_000_000, "recorded intervals; frames + 1 values are kept")
-    behaviour: bool = switch(False, "runs and tumbles, bundles, wobble and motor loads in the summary")
+    behaviour: bool = switch(False, "runs and tumbles, bundles, wrapping, wobble and motor loads in the summary")
     flagella: Flagella = dataclasses.field(default_factory=Flagella)
     flagellum: tuple[FlagellumOverride, ...] = ()
     motor: Motor = dataclasses.field(default_factory=Motor)

@@ -39,6 +39,7 @@ def test_a_made_up_record(made):
         numbers = of_record.digest(record)
     assert numbers["runs"] is None
     assert numbers["bundles"] == {"count": 1.0, "members": 1.0}
+    assert numbers["wrapped"] == {"flagella": 0.0, "along_body": pytest.approx(8 / 31)}  # they begin beside it
     assert numbers["motor_drag"] == pytest.approx([3.4 / (2 * np.pi * 400.0)] * 2)
     json.dumps(plain(numbers), allow_nan=False)
 
@@ -55,7 +56,7 @@ def test_motor_loads_of_a_law_lie_on_its_curve(tmp_path):
 def test_the_summary_and_a_sweeps_table_hold_it_where_the_scene_asks(tmp_path):
     asked = executed(small({"behaviour": True}), tmp_path / "asked")
     found = summary(asked)
-    assert set(found["behaviour"]) == {"runs", "bundles", "wobble", "motor_drag"}
+    assert set(found["behaviour"]) == {"runs", "bundles", "wrapped", "wobble", "motor_drag"}
     assert found["behaviour"]["motor_drag"][0] > 0
     plan = sweep.Sweep(small({"behaviour": True}), {"motor.torque": [2.0]}, {})
     started = sweep.start(plan, tmp_path / "sweep")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import rotation
-from warpflag.observables.behaviour import runs_and_tumbles
+from warpflag.observables.behaviour import exponential_mean, runs_and_tumbles
 
 STEP = 0.002  # s between frames
 EDGE = 0.015  # s: to which edges of pieces are found, three tenths of the averaging time
@@ -117,3 +117,29 @@ def test_the_path_may_lie_and_be_sampled_anyhow():
 def test_a_path_shorter_than_three_averages_is_refused():
     with pytest.raises(ValueError, match=r"path of 100 ms is too short for runs and tumbles: .* the smoothing, 50 ms"):
         runs_and_tumbles(*path([(0.1, 25.0, 0)]))
+
+
+def test_mean_of_durations_of_which_some_are_cut_off():
+    """Runs of 1.3 s in windows of 2 s: the estimate is right within its error, the mean of the whole ones is not."""
+    random, deviations, naive = np.random.default_rng(5), [], []
+    for _ in range(300):
+        seen, ended = [], []
+        for _ in range(20):
+            ends = np.cumsum(random.exponential(1.3, 40))
+            bounds = [0.0, *ends[ends < 2.0], 2.0]
+            seen += [*np.diff(bounds)]
+            ended += [*[True] * (len(bounds) - 2), False]
+            naive += [*np.diff(bounds)[1:-1]]
+        mean, error = exponential_mean(seen, ended)
+        deviations.append((1.3 - mean) / error)
+    assert abs(np.mean(deviations)) < 0.3  # a third of an error at most: 1/mean is unbiased, mean not quite
+    assert np.std(deviations) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(naive) < 0.8
+    assert np.isnan(exponential_mean([2.0], [False])).all()
+
+
+def test_which_runs_and_tumbles_of_a_path_end():
+    found = runs_and_tumbles(*path(PIECES[:4]))
+    assert found.run_ended.tolist() == [True, True] and found.tumble_ended.tolist() == [True, False]
+    mean, error = found.run_length
+    assert mean == pytest.approx(0.9, abs=EDGE) and error == pytest.approx(mean / np.sqrt(2))

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from warpflag.base.rotations import axis_of_body
 from warpflag.observables.arrays import elapsed
-from warpflag.observables.behaviour import bundles, load, precession, runs
+from warpflag.observables.behaviour import body_wrapping, bundles, load, precession, runs
+from warpflag.observables.behaviour.body_wrapping import Wrapping
 from warpflag.observables.behaviour.load import LoadPoint
 from warpflag.observables.behaviour.precession import Wobble
 from warpflag.observables.behaviour.runs import RunsAndTumbles
@@ -17,7 +18,7 @@ from warpflag.observables.recorded import motor_torques
 from warpflag.record import Record
 from warpflag.scene import loads
 
-__all__ = ["bundle_membership", "digest", "motor_loads", "runs_and_tumbles", "wobble"]
+__all__ = ["bundle_membership", "digest", "motor_loads", "runs_and_tumbles", "wobble", "wrapping"]
 
 
 def runs_and_tumbles(record: Record, **options: float) -> RunsAndTumbles:
@@ -68,6 +69,27 @@ def wobble(
     return precession.wobble(record.times[window], -rearward, moved)
 
 
+def wrapping(record: Record, **options: float) -> Wrapping:
+    """How far each flagellum is wrapped round the body, in every frame.
+
+    Options as of `warpflag.observables.behaviour.wrapping`.
+
+    Raises:
+        ValueError: a free filament, without a body.
+        RecordError: the record can't be read.
+    """
+    return _wrapping(record, slice(None), **options)
+
+
+def _wrapping(record: Record, window: slice, **options: float) -> Wrapping:
+    body = loads(record.scene_text).body
+    if not body.enabled:
+        raise ValueError(f"{record.path}: there is no body to wrap round")
+    positions, axes = record.positions[window], axis_of_body(record.body_orientation[window])
+    centres = record.body_position[window]
+    return body_wrapping.wrapping(positions, record.first_node, centres, axes, body.length, body.width, **options)
+
+
 def motor_loads(record: Record, start: float | None = None, stop: float | None = None) -> list[LoadPoint]:
     """Rate, torque and drag at which each motor works; torques that are not constant are those of the record.
 
@@ -91,12 +113,13 @@ def digest(record: Record) -> dict[str, Any]:
     Returns:
         `runs`: their number, mean speed [um/s] and duration [s], number, mean duration [s] and mean angle [deg] of
         tumbles, tumbling fraction; None for a run too short. Over the last third `bundles`: mean number, and part of
-        the flagella that are in one; `wobble`: of body and bundle, angles [deg] and rates [Hz], None for a body that
-        stands still; `motor_drag` of each motor [pN um s]. All None where there are fewer than two frames.
+        the flagella that are in one; `wrapped`: part of the flagella that are, and of their nodes along the body, None
+        without a body; `wobble`: of body and bundle, angles [deg] and rates [Hz], None for a body that stands still;
+        `motor_drag` of each motor [pN um s]. All None where there are fewer than two frames.
     """
     window = record.window(None, None)
     if len(record.times[window]) < 2:
-        return {"runs": None, "bundles": None, "wobble": None, "motor_drag": None}
+        return dict.fromkeys(("runs", "bundles", "wrapped", "wobble", "motor_drag"))
     membership = bundles.bundle_membership(record.positions[window], record.first_node)
     moves = np.ptp(record.body_position[window], axis=0).any()
     return {
@@ -105,6 +128,7 @@ def digest(record: Record) -> dict[str, Any]:
             "count": float(bundles.bundle_counts(membership).mean()),
             "members": float((membership != bundles.ALONE).mean()),
         },
+        "wrapped": _of_wrapping(record, window),
         "wobble": {of: _in_degrees(wobble(record, of)) for of in ("body", "bundle")} if moves else None,
         "motor_drag": [point.drag for point in motor_loads(record)],
     }
@@ -119,11 +143,19 @@ def _of_runs(record: Record) -> dict[str, float | int] | None:
         "runs": len(found.runs),
         "run_speed": found.run_speed,
         "run_duration": _mean(found.run_durations),
+        "run_length": found.run_length[0],
         "tumbles": len(found.tumbles),
         "tumble_duration": _mean(found.tumble_durations),
         "tumble_angle": float(np.degrees(_mean(angles))),
         "tumbling_fraction": found.tumbling_fraction,
     }
+
+
+def _of_wrapping(record: Record, window: slice) -> dict[str, float] | None:
+    if not loads(record.scene_text).body.enabled:
+        return None
+    found = _wrapping(record, window)
+    return {"flagella": float(found.wrapped.mean()), "along_body": float(found.share.mean())}
 
 
 def _mean(values: NDArray[np.floating]) -> float:

@@ -18,6 +18,7 @@ __all__ = [
     "SMOOTHING",
     "TURNING",
     "RunsAndTumbles",
+    "exponential_mean",
     "runs_and_tumbles",
 ]
 
@@ -76,6 +77,21 @@ class RunsAndTumbles:
         return self._whole(self.tumbles)
 
     @property
+    def run_ended(self) -> NDArray[np.bool_]:
+        """Whether the path shows the end of each run, shape [run_count]; see `exponential_mean`."""
+        return self.runs[:, 1] < self.times[-1]
+
+    @property
+    def tumble_ended(self) -> NDArray[np.bool_]:
+        """Whether the path shows the end of each tumble, shape [tumble_count]."""
+        return self.tumbles[:, 1] < self.times[-1]
+
+    @property
+    def run_length(self) -> tuple[float, float]:
+        """Mean duration of a run and its standard error [s], those cut off by the ends of the path counted."""
+        return exponential_mean(np.diff(self.runs, axis=1)[:, 0], self.run_ended)
+
+    @property
     def run_speed(self) -> float:
         """Mean speed in runs, weighted with their durations [um/s]; NaN without a run."""
         lengths = np.diff(self.runs, axis=1)[:, 0]
@@ -89,6 +105,30 @@ class RunsAndTumbles:
     def _whole(self, pieces: Array) -> Array:
         inside = (pieces[:, 0] > self.times[0]) & (pieces[:, 1] < self.times[-1])
         return np.diff(pieces[inside], axis=1)[:, 0]
+
+
+def exponential_mean(durations: ArrayLike, ended: ArrayLike) -> tuple[float, float]:
+    """Mean of exponentially distributed durations of which some were cut off, and its standard error.
+
+    The maximum-likelihood estimate: all time over the number of ends, with the relative error of that number,
+    1/sqrt(ends). The mean of the durations seen whole is too small, since long ones are cut off more often. Beginnings
+    need not be seen, as the rate of ending does not depend on the time that has passed.
+
+    Args:
+        durations: seen of each piece, whole or not; of one path or many [s].
+        ended: whether its end was seen.
+
+    Returns:
+        mean and standard error [s]; NaN where no end was seen.
+
+    Source:
+        Lawless, Statistical Models and Methods for Lifetime Data, 2nd ed. (2003), section 4.1.
+    """
+    durations, ends = np.asarray(durations, float), int(np.sum(ended))
+    if not ends:
+        return float("nan"), float("nan")
+    mean = float(durations.sum() / ends)
+    return mean, mean / ends**0.5
 
 
 def runs_and_tumbles(
