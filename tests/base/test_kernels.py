@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import io
 import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import warp as wp
@@ -11,9 +15,11 @@ import warp as wp
 from tests.helpers import cell
 from warpflag.base import kernels
 from warpflag.base.device import find_device
+from warpflag.base.kernel_cache import keep_checksums, remove_damaged
 from warpflag.base.kernels import load_kernels, noted_launches
 from warpflag.run.simulation import Simulation
 
+ROOT = Path(__file__).parents[2]
 _NUMBER = itertools.count()
 
 
@@ -80,6 +86,75 @@ def test_quiet_says_nothing(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(kernels, "_SECONDS_BEFORE_EXPLAINING", 0.0)
     load_kernels(two_kernels()[2], find_device("cpu"), quiet=True)
     assert len(list(tmp_path.iterdir())) == 2 and capfd.readouterr() == ("", "")
+
+
+RUN = """
+from warpflag.base.device import find_device, start_warp
+from warpflag.base.kernels import load_kernels
+
+wp = start_warp()
+
+@wp.kernel(enable_backward=False, module="unique")
+def fill(
+    # Out:
+    values: wp.array(dtype=wp.int32),
+):
+    values[wp.tid()] = 7
+
+values = wp.zeros(3, dtype=wp.int32, device="cpu")
+launch = lambda: wp.launch(fill, 3, inputs=[values], device="cpu")
+load_kernels(launch, find_device("cpu"))
+launch()
+print(values.numpy().tolist())
+"""
+
+
+def test_a_damaged_file_of_the_kernel_cache_is_compiled_again(tmp_path):
+    script, cache = tmp_path / "run.py", tmp_path / "cache"
+    script.write_text(RUN)
+
+    def run():
+        own = {**os.environ, "WARP_CACHE_PATH": str(cache)}
+        ended = subprocess.run([sys.executable, str(script)], cwd=ROOT, env=own, capture_output=True, text=True)
+        assert ended.returncode == 0 and ended.stdout == "[7, 7, 7]\n", ended.stderr
+        return [line for line in ended.stderr.splitlines() if "compiling" not in line]
+
+    assert run() == []
+    (compiled,) = cache.rglob("*.o")
+    content = bytearray(compiled.read_bytes())
+    content[len(content) // 2] ^= 4
+    compiled.write_bytes(content)
+    (said,) = run()
+    assert "damaged" in said and str(cache) in said
+    assert compiled.read_bytes() != content and run() == []
+
+
+@pytest.mark.parametrize("suffix", [".o", ".cubin", ".ptx", ".meta", ".o.crc32"])
+@pytest.mark.parametrize("content", [b"", b"0", b"compile", b"complied", b"\xff\xfe"])
+def test_whatever_changed_since_it_was_loaded_is_removed(suffix, content, tmp_path):
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.mkdir()
+        for kind in (".o", ".cubin", ".ptx", ".meta", ".cpp"):
+            (folder / f"module{kind}").write_bytes(b"compiled")
+    keep_checksums([*folders, tmp_path / "not there"])
+    assert remove_damaged([*folders, tmp_path / "not there"]) == []
+    (folders[0] / f"module{suffix}").write_bytes(content)
+    assert remove_damaged(folders) == [folders[0]]
+    assert [path.name for path in folders[0].iterdir()] == ["module.cpp"]
+    assert len(list(folders[1].iterdir())) == 9
+
+
+def test_a_cache_that_cannot_be_written_is_used_as_it_is(tmp_path, monkeypatch):
+    (tmp_path / "module.o").write_bytes(b"compiled")
+
+    def refuse(*_arguments, **_options):
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    keep_checksums([tmp_path])
+    assert remove_damaged([tmp_path]) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["module.o"]
 
 
 @pytest.mark.parametrize(

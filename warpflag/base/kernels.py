@@ -12,19 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from warpflag.base.device import cores, start_warp
+from warpflag.base.kernel_cache import keep_checksums, kernel_folder, remove_damaged
 from warpflag.base.progress import bar
 from warpflag.base.streams import is_terminal, tell
 
-__all__ = ["kernel_folder", "load_kernels", "noted_launches"]
+__all__ = ["load_kernels", "noted_launches"]
 
 _MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
 _SECONDS_BEFORE_EXPLAINING = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
 _SECONDS_PER_LOOK = 0.2  # between two counts of what has been compiled: five a second
-
-
-def kernel_folder() -> Path:
-    """Where Warp keeps compiled kernels: WARP_CACHE_PATH, or a folder of the user's cache."""
-    return Path(start_warp().config.kernel_cache_dir)
+_SOUND: set[Path] = set()  # folders of the modules that this process has loaded
 
 
 @contextlib.contextmanager
@@ -67,20 +64,26 @@ def load_kernels(launch: Callable[[], None], device: Any, quiet: bool = False) -
         launch()
     modules = {(kernel.module, block) for kernel, block in noted}
     waiting = sorted(((module, block) for module, block in modules), key=lambda own: (own[0].name, own[1] or 0))
-    folder = kernel_folder()
-    missing = {folder / module.get_module_identifier(1 if device.is_cpu else block) for module, block in waiting}
-    missing = {path for path in missing if not path.exists()}
+    identifiers = {module.get_module_identifier(1 if device.is_cpu else block) for module, block in waiting}
+    folders = {kernel_folder() / identifier for identifier in identifiers}
+    fresh = folders - _SOUND
+    damaged = remove_damaged(fresh)
+    if damaged and not quiet:
+        tell(f"{len(damaged)} compiled modules in {kernel_folder()} were damaged, and are compiled again")
+    missing = {path for path in folders if not path.exists()}.union(damaged)
     if not missing:
         for module, block in waiting:
             _load(module, block, device)
-        return
-    with _explained(missing, quiet):
-        pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores()))
-        try:
-            for loaded in [pool.submit(_load, module, block, device) for module, block in waiting]:
-                loaded.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
+    else:
+        with _explained(missing, quiet):
+            pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores()))
+            try:
+                for loaded in [pool.submit(_load, module, block, device) for module, block in waiting]:
+                    loaded.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
+    keep_checksums(fresh)
+    _SOUND.update(folders)
 
 
 def _load(module: Any, block: int | None, device: Any) -> None:
