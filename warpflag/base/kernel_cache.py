@@ -15,7 +15,7 @@ from pathlib import Path
 
 from warpflag.base.device import start_warp
 
-__all__ = ["kernel_folder", "keep_checksums", "remove_damaged"]
+__all__ = ["keep_checksums", "kernel_folder", "remove_damaged"]
 
 _LOADED = (".o", ".cubin", ".ptx", ".meta")  # what Warp reads when it loads a module
 _CHECKSUM = ".crc32"
