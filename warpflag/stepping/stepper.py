@@ -65,6 +65,7 @@ def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
     c.error_sum.zero_()
     c.error_time.zero_()
     c.rejected_error.zero_()
+    c.lowered.fill_(1.0)
     first = FIRST_STEP / step_control.SHORTEST_STEP * c.shortest.numpy()
     c.wanted_step.assign(np.where(c.error_rate.numpy() > 0.0, first, fixed_start))
 
@@ -76,7 +77,7 @@ def allocated_control(scenes: Sequence[Scene], fixed: Sequence[bool], device: An
     return step_control.allocate(accuracies, fixed, stopping, [pace(scene) for scene in scenes], device)
 
 
-_CONTROL_MEMORY = ("wanted_step", "error_sum", "error_time", "rejected")
+_CONTROL_MEMORY = ("wanted_step", "error_sum", "error_time", "lowered", "rejected")
 _ACHIEVED_MEMORY = (*accuracy.SUMS, "at_shortest")
 
 

@@ -8,6 +8,9 @@ motion quickens within less than that, as a filament that snaps, steps are rejec
 Errors of equal sign from step to step add up in proportion to the number of steps n, so one step may make the error
 error_rate dt. Independent ones add up as n^1/2, and one step may make error_rate (dt SPAN)^1/2. Which of the two holds
 is a property of the stepper, and of the step (`accuracy.CORRELATION`).
+
+Errors of equal sign add up with the jumps, and to more than the mean logarithm says where estimates fluctuate. So the
+rate that steps aim at is lowered for as long as they make more than the rate that was asked for (`lowered`).
 """
 
 import functools
@@ -31,6 +34,10 @@ REJECTED_SYSTEMATIC = 25.0
 SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
 MEMORY = 20.0  # over how many steps that mean fades
 MEMORY_SYSTEMATIC = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
+# Shortest steps in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in water as long
+# as the windows for which errors are told (`accuracy.WINDOW`), in thinner fluids shorter.
+LOWERING = 5000.0
+LOWEST = 1.0e-2  # of that rate, over what was asked: steps are then a tenth as long
 FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of its memory
 # If halving a rejected step leaves more than this fraction of its error, the velocity itself jumps (smooth: 1/8), and
 # shorter steps do not help.
@@ -50,6 +57,7 @@ class StepControl:
     wanted_step: wp.array(dtype=wp.float64)  # [s]
     error_sum: wp.array(dtype=wp.float64)  # exponentially weighted sum of dt log(error/dt^3)
     error_time: wp.array(dtype=wp.float64)  # the same of dt, the total weight [s]
+    lowered: wp.array(dtype=wp.float64)  # rate that steps aim at over error_rate, for errors of equal sign
     rejected: wp.array(dtype=wp.int32)  # steps rejected so far
     rejected_error: wp.array(dtype=wp.float64)  # estimate of the last attempt if that was rejected for it, else 0 [um]
     shortest: wp.array(dtype=wp.float64)  # that an estimate asks for [s]
@@ -76,6 +84,7 @@ def allocate(
     c.wanted_step, c.error_sum, c.error_time, c.rejected_error = (
         wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(4)
     )
+    c.lowered = wp.ones(cells, dtype=wp.float64, device=device)
     c.rejected = wp.zeros(cells, dtype=wp.int32, device=device)
     return c
 
@@ -93,6 +102,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump = wp.constant(wp.float64(JUMP))
+    lowering, lowest = wp.constant(wp.float64(LOWERING)), wp.constant(wp.float64(LOWEST))
 
     @wp.func(module=module)
     def allowed(control: StepControl, c: wp.int32, dt: wp.float64):
@@ -132,6 +142,13 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             good = sound and (error < rejection * most or jumps or dt <= control.shortest[c])
             if good and dt <= control.shortest[c] and error > most:
                 control.achieved.at_shortest[c] += 1
+            aim = control.error_rate[c]
+            if wp.static(not independent):
+                if good and dt > control.shortest[c]:
+                    share = wp.where(error > lost, wp.min(error / most, rejection), wp.float64(0.0))
+                    lowered = control.lowered[c] * wp.exp((one - share) * dt / (lowering * control.shortest[c]))
+                    control.lowered[c] = wp.clamp(lowered, lowest, one)
+                aim *= control.lowered[c]
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
                 level = wp.log(bound / (dt * dt * dt))
@@ -155,7 +172,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                         control.error_time[c] = wp.float64(0.0)
                 if (seen or hidden) and control.error_time[c] > wp.float64(0.0):
                     level = wp.exp(control.error_sum[c] / control.error_time[c])
-                    best = longest_step(safety * control.error_rate[c], level)
+                    best = longest_step(safety * aim, level)
                     factor = wp.min(growth, wp.max(best, control.shortest[c]) / dt)
         if good:
             control.rejected_error[c] = wp.float64(0.0)
