@@ -31,7 +31,7 @@ def stepped(spread: float, jumps: float, precision: str, device: str) -> tuple[f
         sums: wp.array(dtype=wp.float64),
     ):
         time = wp.float64(0.0)
-        i = int(0)
+        i = wp.int32(0)
         while time < wp.static(wp.float64(TIME)) and i < noise.shape[0]:
             dt = wp.min(steps.wanted_step[0], wp.float64(1.0e-4))
             error = wp.static(wp.float64(LEVEL)) * dt * dt * dt * noise[i]
