@@ -101,12 +101,14 @@ def test_the_time_of_stepping_is_told_by_the_speed_of_a_sample(duration, monkeyp
     assert found.stepping == pytest.approx(2e3 * duration) and found.sampled == pytest.approx(clock[0] - 1.0)
 
 
-def test_a_stiff_helix_turns_as_resistive_force_theory_says():
+@pytest.mark.parametrize("spin", [1.26e-6, 3e-4])
+def test_a_stiff_helix_turns_as_resistive_force_theory_says(spin):
     """Local drag alone: closed forms for a helix of many segments, free to move along its axis."""
-    scene = small({"flagella.length": 6.0, "flagella.segment_length": 0.05, "hydrodynamics.mode": "none"})
+    values = {"flagella.length": 6.0, "flagella.segment_length": 0.05, "hydrodynamics.mode": "none"}
+    scene = small({**values, "fluid.drag_rotation": spin})
     found = turning(scene)
     o = np.array(scene.flagella.intrinsic_curvature)
-    strain, (along, across, spin) = np.linalg.norm(o), (1.6e-3, 2.8e-3, 1.26e-6)
+    strain, (along, across) = np.linalg.norm(o), (1.6e-3, 2.8e-3)
     radius, c = abs(o[1]) / strain**2, abs(o[2]) / strain
     s = math.sqrt(1 - c * c)
     turn = radius**2 * (along * s * s + across * c * c) + spin * c * c
@@ -147,6 +149,10 @@ def test_the_time_is_a_range_of_its_parts():
         ({"motor.torque": -1.0}, "beyond 1 pN um, below polymorphs.nucleation 1.1"),
         ({"motor.torque": -1.2}, None),
         ({"motor.torque": 1.2, "flagella.intrinsic_curvature": (0.0, 1.3, 2.1)}, None),
+        (
+            {"motor.torque": 1.2, "motor.reverse_torque": 0.9, "flagella.intrinsic_curvature": (0.0, 1.3, 2.1)},
+            None,  # forward winds up
+        ),
         ({"motor.torque": 1.2, "motor.switching": "schedule"}, "against the handedness"),
         ({"motor.torque": 1.2, "motor.switching": "schedule", "motor.switch_times": (1e-3,)}, None),
         ({"motor.switching": "markov", "motor.reverse_torque": 0.9}, "beyond 0.9 pN um, below"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import re
 from itertools import combinations
@@ -11,7 +13,7 @@ import pytest
 
 from tests.runs import small
 from warpflag.model.geometry import initial_state
-from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, start
+from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, start, table
 from warpflag.scene import SceneError, dumps, load, with_values
 
 
@@ -232,3 +234,20 @@ def test_of_many_bad_members_the_first_are_named(folder):
     with pytest.raises(BadMembers, match="and 80 more members") as refused:
         members(folder, "[axes]\nmotor.torque = {from = 2e4, to = 3e4, count = 100}\n")
     assert len(str(refused.value).splitlines()) == 21
+
+
+def test_means_are_of_the_repeats_that_are_done(tmp_path):
+    """Of four one was stopped and one has only begun; of those that are done one had not zipped when it ended."""
+    made = [("done", 1.0, 2e-3), ("done", 4.0, None), ("stopped", 100.0, 1e-3), ("begun", 50.0, None)]
+    for k, (status, speed, zipped) in enumerate(made):
+        (tmp_path / f"{k}").mkdir()
+        said = {"status": status, "rates": {"net_speed": speed}, "events": {"zipped": zipped}}
+        (tmp_path / f"{k}" / "summary.json").write_text(json.dumps(said))
+    plan = Sweep(small(), random={"flagellum.torque": {"low": 1.0, "high": 2.0}}, repeats=4)
+    table.write(tmp_path, plan.members(), [f"{k}" for k in range(4)])
+    with open(tmp_path / "means.csv", newline="") as file:
+        (mean,) = csv.DictReader(file)
+    assert (mean["status"], mean["count"]) == ("2 of 4 done", "2")
+    assert float(mean["rates.net_speed"]) == 2.5 and float(mean["rates.net_speed.error"]) == pytest.approx(1.5)
+    assert float(mean["events.zipped"]) == 2e-3 and mean["events.zipped.count"] == "1"
+    assert mean["events.zipped.error"] == ""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from warpflag_kernels.base.clock import NO_FAULT
-from warpflag_kernels.contact import search
+from warpflag_kernels.contact import neighbours, search
 from warpflag_kernels.stepping import health
 from warpflag_kernels.stepping.health import Fault
 
@@ -298,6 +298,20 @@ def test_crossings_are_those_of_dense_sampling(looked_at, device, precision):
         assert not answer[away].any(), np.flatnonzero(away & answer)
         crossings, silent = crossings + crossed.sum(), silent + (away & turned).sum()
     assert crossings > 200 and silent > 200
+
+
+@pytest.mark.parametrize("listed_at", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("way", [0.02, 0.9])
+def test_crossings_are_seen_wherever_the_lists_were_built(way, listed_at, device, precision):
+    """Two filaments across each other, one of which moves through the other from beyond the reach of the lists, too."""
+    for aside, expected in ((0.0, True), (0.6, False)):
+        sim = Simulation(cell({"flagella.length": 0.4, "numerics.stepper": "implicit"}, precision), device=device)
+        along = 0.2 * (np.arange(3.0) - 0.6)[:, None]
+        still, moving = along * [1.0, 0.0, 0.0], along * [0.1, 1.0, 0.0] + [aside, 0.0, 0.0]
+        before, after = (np.array([[still, moving + [0.0, 0.0, z]]]) for z in (way / 2, -way / 2))
+        place(sim, before + listed_at * (after - before))
+        neighbours.refresh(sim.system.model, sim.system.state)
+        assert seen(sim, before, after, None)[0] == expected
 
 
 @pytest.mark.parametrize(("apart", "kind"), [(0.0, Fault.CROSSING), (1e-3, Fault.CROSSING), (4e-3, None), (0.03, None)])
