@@ -66,6 +66,15 @@ def test_a_cell_that_stops_to_tumble(coil):
     assert found.tumbling[expected].all() and not found.tumbling[found.times < 0.79].any()
 
 
+def test_stops_with_short_runs_between_are_one_tumble():
+    """Each too short for a tumble of its own; one alone is part of a run."""
+    stop, go = (0.014, 0.0, 0), (0.03, 20.0, 0)
+    pieces = [(0.5, 20.0, 0), stop, go, stop, go, stop, (0.5, 20.0, 0), stop, (0.5, 20.0, 0)]
+    found = runs_and_tumbles(*path(pieces, step=2e-4), smoothing=1e-3)
+    np.testing.assert_allclose(found.tumbles, [[0.5, 0.5 + 3 * 0.014 + 2 * 0.03]], atol=1e-3)
+    assert len(found.runs) == 2 and found.runs[-1, 1] == found.times[-1]
+
+
 def test_a_cell_that_turns_without_slowing_down():
     """A turn of 90 degrees in 0.1 s, 16 rad/s; one of 90 degrees in 1 s, 1.6 rad/s, is part of a run."""
     found = runs_and_tumbles(*path([(0.5, 20.0, 0), (0.1, 20.0, 90), (0.5, 20.0, 0), (1.0, 20.0, 90), (0.5, 20.0, 0)]))
