@@ -24,6 +24,7 @@ from tests.contacts import (
     touching,
 )
 from tests.oracles import body_gaps, segment_distances
+from tests.plans import by_elements
 
 # The list.
 
@@ -42,11 +43,15 @@ def expected_contacts(b: Bench, reach: float) -> dict[tuple[int, int], float]:
     return near
 
 
+PLANNED = pytest.mark.parametrize("planned", [lambda own: own, by_elements], ids=["own", "elements"])
+
+
+@PLANNED
 @pytest.mark.parametrize("values", [{}, CROWD], ids=["two", "three"])
-def test_search_finds_every_contact_and_nothing_else(values, device, precision):
+def test_search_finds_every_contact_and_nothing_else(values, planned, device, precision):
     total = 0
     for seed in range(4):
-        b = touching(values, precision, device, seed)
+        b = touching(values, precision, device, seed, planned=planned)
         find(b)
         found, exact = listed_contacts(b), expected_contacts(b, REACH + 1e-6)
         assert found.keys() <= exact.keys()
@@ -76,8 +81,9 @@ def chain_of(head: int, following: np.ndarray) -> list[int]:
     return found
 
 
-def test_chains_hold_every_contact_once_on_either_side(device, precision):
-    b = touching(BUNDLE, precision, device, seed=0)
+@PLANNED
+def test_chains_hold_every_contact_once_on_either_side(planned, device, precision):
+    b = touching(BUNDLE, precision, device, seed=0, planned=planned)
     for _ in range(2):  # the second search meets the chains of the first
         find(b)
     c, contact_count = b.stepper.contacts, len(listed_contacts(b))
@@ -95,8 +101,9 @@ def test_chains_hold_every_contact_once_on_either_side(device, precision):
     assert (other[:contact_count] < 0).sum() > 1 and (other[:contact_count] >= 0).sum() > 5
 
 
-def test_a_contact_list_that_overflows_is_noticed(device, precision):
-    b = touching({}, precision, device)
+@PLANNED
+def test_a_contact_list_that_overflows_is_noticed(planned, device, precision):
+    b = touching({}, precision, device, planned=planned)
     find(b)
     count = len(listed_contacts(b))
     b.stepper.contacts.first.assign([0, count - 1])
