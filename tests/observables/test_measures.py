@@ -109,6 +109,16 @@ def test_helix_rate_of_turning_precessing_and_swimming_helices():
     np.testing.assert_allclose(rates, [700.0 + share, -400.0 + share], rtol=2e-3)
 
 
+def test_helix_rate_is_exact_of_an_axis_that_sweeps_fast():
+    """20 degrees a frame in a plane, which is the minimal rotation of the axis, and 40 about itself."""
+    frames = []
+    for k in range(12):
+        swept = rotation([0.0, np.radians(20.0 * k), 0.0])
+        frames.append(helix(31, phase=np.radians(40.0 * k))[0] @ swept.T)
+    rates = observables.helix_rate(1e-3 * np.arange(12), np.array(frames), np.array([0, 31]))
+    np.testing.assert_allclose(rates, 40.0 / 360.0 / 1e-3, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("bend", "tolerance"), [(20.0, 1e-3), (5.0, 3e-3), (3.0, 1e-2)])
 def test_helix_rate_of_a_bent_helix_is_that_about_its_bent_axis(bend, tolerance):
     """One rotation fitted to all tangents, whose axes fan out over 100 degrees at a bend of 3 um, would be 38 % low."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import numpy as np
 import pytest
+import warp as wp
 from warpflag_kernels.stepping import accuracy
 from warpflag_kernels.stepping.health import Fault
 from warpflag_kernels.stepping.step_control import SHORTEST_STEP
@@ -88,6 +92,40 @@ def test_the_device_adds_up_the_estimates_of_accepted_steps(stepper, device):
     assert worst > 0.0 and begin > 0
     assert (achieved["worst"], achieved["worst_end"]) == pytest.approx((worst, worst_end), rel=TOLERANCE)
     assert achieved["window_time"] == pytest.approx(lengths[begin:].sum(), rel=TOLERANCE)
+
+
+@functools.cache
+def counting(independent: bool) -> Any:
+    """A kernel that counts steps whose estimates are a share of what they may make, until that is too much."""
+    add, may_make = accuracy.functions(independent).add, accuracy.functions(independent).may_make
+
+    @wp.kernel(module="unique")
+    def count(
+        achieved: accuracy.Achieved,
+        dt: wp.float64,
+        share: wp.float64,
+        steps: wp.int32,
+        stopped: wp.array(dtype=wp.int32),
+    ):
+        error = share * may_make(achieved.asked[0], dt)
+        for i in range(steps):
+            if stopped[0] == 0 and add(achieved, 0, dt, error, wp.float64(1.0), wp.float64(0.0)):
+                stopped[0] = i + 1
+
+    return count
+
+
+@pytest.mark.parametrize("independent", [True, False])
+@pytest.mark.parametrize("stopping", [True, False])
+def test_a_run_is_stopped_by_what_a_single_millisecond_makes(independent, stopping, device):
+    """Steps of 10 us that all err by a share of what they may: for ever where that is below ten, else within 1 ms."""
+    for share, expected in ((9.0, 0), (11.0, 83 if independent else 91)):
+        achieved = accuracy.allocate([5e-3], [stopping], device)
+        stopped = wp.zeros(1, dtype=wp.int32, device=device)
+        wp.launch(counting(independent), 1, inputs=[achieved, 1e-5, share, 3000, stopped], device=device)
+        assert stopped.numpy()[0] == (expected if stopping else 0)
+        found = {name: float(getattr(achieved, name).numpy()[0]) for name in accuracy.SUMS}
+        assert accuracy.estimates(found, independent) == pytest.approx((share, share))
 
 
 def test_a_run_beyond_ten_times_its_accuracy_stops_or_says_so(tmp_path):

@@ -308,7 +308,7 @@ def test_crossings_are_seen_wherever_the_lists_were_built(way, listed_at, device
         sim = Simulation(cell({"flagella.length": 0.4, "numerics.stepper": "implicit"}, precision), device=device)
         along = 0.2 * (np.arange(3.0) - 0.6)[:, None]
         still, moving = along * [1.0, 0.0, 0.0], along * [0.1, 1.0, 0.0] + [aside, 0.0, 0.0]
-        before, after = (np.array([[still, moving + [0.0, 0.0, z]]]) for z in (way / 2, -way / 2))
+        before, after = (np.array([[still, np.add(moving, [0.0, 0.0, z])]]) for z in (way / 2, -way / 2))
         place(sim, before + listed_at * (after - before))
         neighbours.refresh(sim.system.model, sim.system.state)
         assert seen(sim, before, after, None)[0] == expected
