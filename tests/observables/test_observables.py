@@ -177,6 +177,15 @@ def test_a_gap_may_be_passed_over():
     np.testing.assert_allclose(observables.bundled_fraction(*fine, gap=1.0), steady, atol=1 / 30)
 
 
+@pytest.mark.parametrize("stretch", [0.999, 1.0, 1.001])
+def test_a_gap_is_as_many_segments_as_it_is_nearest_to(stretch):
+    """Five nodes of segments that are 0.2 um but for their strain."""
+    straight, other = stretch * line(31), stretch * line(31, x=0.3)
+    other[10:15, 0] = 2.0
+    assert observables.bundled_fraction(*joined(straight, other), gap=1.0)[1] == 1.0
+    assert observables.bundled_fraction(*joined(straight, other), gap=0.85)[1] == pytest.approx(9 / 30)
+
+
 def test_zip_is_complete_once_it_holds():
     times = 1e-4 * np.arange(10)
     lengths = np.array([0.1, 0.98, 0.5, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0])

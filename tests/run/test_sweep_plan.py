@@ -7,13 +7,15 @@ import json
 import math
 import re
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.runs import small
 from warpflag.model.geometry import initial_state
-from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, start, table
+from warpflag.run.stop import Stop
+from warpflag.run.sweep import BadMembers, Sweep, grid_axes, pool, read, start, table
 from warpflag.scene import SceneError, dumps, load, with_values
 
 
@@ -234,6 +236,36 @@ def test_of_many_bad_members_the_first_are_named(folder):
     with pytest.raises(BadMembers, match="and 80 more members") as refused:
         members(folder, "[axes]\nmotor.torque = {from = 2e4, to = 3e4, count = 100}\n")
     assert len(str(refused.value).splitlines()) == 21
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(0.0, 8e-5), (5e-5, 8e-5), (1.2e-4, 1.2e-4)])
+def test_members_that_ended_count_with_all_that_they_reached(seen, expected, monkeypatch):
+    """Whatever their worker last said of a batch: one is done, the other was stopped."""
+
+    class Instant:
+        """A worker that ends a batch at once."""
+
+        def __init__(self, device, starter):
+            self.device, self.reached, self.thread = device, 0.0, None
+
+        def ask(self, request):
+            self.reached = seen
+            return {"outcomes": [["done", ""], ["stopped", "by a guard"]]}
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(pool, "_Worker", Instant)
+    scenes = [small(), small()]
+    with pool.Pool(["somewhere"], {}) as workers, Stop() as stop:
+        workers.start(scenes[0], stop)
+        workers.submit(pool.Batch([0, 1], [Path("0"), Path("1")], scenes))
+        ended = []
+        while not workers.is_done:
+            workers.wait()
+            ended += workers.finished()
+        assert [outcome.status for outcome in ended[0][1]] == ["done", "stopped"]
+        assert workers.reached == pytest.approx(expected)
 
 
 def test_means_are_of_the_repeats_that_are_done(tmp_path):
