@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.contacts import steric_force
 from tests.films import THREE, made_record
+from tests.oracles import segment_distances
 from tests.runs import executed, small
 from warpflag.model.geometry import ground_state
 from warpflag.observables import local_phase_difference, phase_difference, segment_tangents
@@ -64,6 +66,19 @@ def test_load_of_many_contacts_is_the_sum_over_all_pairs():
                         two = positions[frame, [i - 1, i, j - 1, j]][None]
                         pairwise[[i - 1, i, j - 1, j]] += contact_load(two, np.array([0, 2, 4]), STRENGTH, DIAMETER)[0]
         np.testing.assert_allclose(together[frame], pairwise, rtol=1e-9, atol=1e-12)
+
+
+def test_no_contact_of_a_crowd_is_left_out():
+    """Short rods in a box many times as wide as the distance in which contacts are looked for."""
+    rng = np.random.default_rng(4)
+    starts = rng.uniform(0.0, 0.6, (400, 3))
+    vectors = rng.uniform(-0.01, 0.01, (400, 3))
+    positions = np.stack([starts, starts + vectors], axis=1).reshape(1, -1, 3)
+    distances = segment_distances(starts, vectors, starts, vectors)
+    forces = steric_force(distances, STRENGTH)[np.triu_indices(400, 1)]
+    assert (forces > 0.0).sum() > 100
+    load = contact_load(positions, 2 * np.arange(401), STRENGTH, DIAMETER)
+    assert 0.5 * load.sum() == pytest.approx(forces.sum(), rel=1e-9)
 
 
 def test_a_flagellum_does_not_touch_itself():
