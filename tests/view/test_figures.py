@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tests.films import made_record
+from tests.films import THREE, made_record
 from tests.runs import executed, small
 from tests.shapes import Zipping
 from warpflag import cli
@@ -100,6 +100,22 @@ def test_one_flagellum_has_a_dashboard_without_a_bundle(tmp_path):
     panels = panels_of(figures.dashboard(directory))
     assert "swimming speed $v$ (µm/s)" in panels and LENGTH not in panels
     assert "swimming speed $v$ (µm/s)" in panels_of(figures.comparison([directory, directory]))
+
+
+def test_forms_are_drawn_along_each_flagellum_one_above_the_other(tmp_path):
+    """A cell edge half way between frames and between joints; each flagellum begins where the one before ends."""
+    scene = with_values(THREE, {"polymorphs.enabled": True})
+    made_record(tmp_path, 6, scene=scene).close()
+    run = figures.read(tmp_path)
+    (panel,) = [axes for title, axes in panels_of(figures.dashboard(run)).items() if title.startswith("forms")]
+    meshes = panel.collections
+    assert len(meshes) == 3
+    for mesh, begin, length, forms in zip(meshes, (0.0, 6.0, 10.0), (6.0, 4.0, 6.0), run.forms, strict=True):
+        places = mesh.get_coordinates()
+        assert places[0, 0, 1] == pytest.approx(begin + 0.1) and places[-1, 0, 1] == pytest.approx(begin + length - 0.1)
+        assert places[0, [0, 1, -1], 0].tolist() == pytest.approx([0.0, 0.5 * run.times[1], run.times[-1]])
+        np.testing.assert_array_equal(np.reshape(mesh.get_array(), forms.T.shape), forms.T)
+    assert panel.get_ylim()[1] > 16.0
 
 
 def test_a_short_peak_does_not_flatten_the_rest_and_is_told(tmp_path):

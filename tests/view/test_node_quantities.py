@@ -164,6 +164,11 @@ def test_forms_have_a_colour_each_and_ends_that_of_their_neighbour(tmp_path):
         assert values[:, first : first + 8].tolist() == [
             [i >= 1] * 2 + [n <= 2 * i for n in range(2, 8)] for i in range(4)
         ]
+    with made_record(tmp_path / "whole", 16) as whole:
+        shown = Coloring("form", whole, THREE).values(whole.positions[:], slice(0, 16))
+    for end in record.first_node[1:]:
+        assert np.array_equal(shown[:, end - 1], shown[:, end - 2])
+    assert shown[-1].all()
     colors = coloring.colors(values)
     assert np.array_equal(
         np.unique(colors.reshape(-1, 3), axis=0), np.unique([linear(c) for c in FORM_COLORS[:2]], axis=0)

@@ -78,9 +78,17 @@ def test_three_hundred_frames_stay_below_three_megabytes(tmp_path):
         page = page_of(record)
         assert len(page.encode()) < 3e6
         # A notebook leaves frames out evenly, and says so.
-        shorter = content_of(page_of(record, most_bytes=100_000))
-        assert shorter["frameStride"] == 2 and shorter["times"] == content_of(page)["times"][::2]
-        np.testing.assert_allclose(positions_of(shorter), positions_of(content_of(page))[::2], atol=4e-4)
+        shorter, whole = content_of(page_of(record, most_bytes=100_000)), content_of(page)
+        assert shorter["frameStride"] == 2 and shorter["times"] == whole["times"][::2]
+        np.testing.assert_allclose(positions_of(shorter), positions_of(whole)[::2], atol=4e-4)
+        for part, name, size in (("body", "positions", 3), ("body", "orientations", 4), ("motors", "angles", 2)):
+            few, all_of_them = (numbers(shown[part][name], "<f4").reshape(-1, size) for shown in (shorter, whole))
+            np.testing.assert_array_equal(few, all_of_them[::2], err_msg=name)
+        for name, sent in shorter["colorings"].items():
+            few, all_of_them = (numbers(own["shares"], "u1") for own in (sent, whole["colorings"][name]))
+            np.testing.assert_array_equal(few.reshape(151, -1), all_of_them.reshape(301, -1)[::2], err_msg=name)
+        for few, all_of_them in zip(shorter["curves"], whole["curves"], strict=True):
+            assert few["lines"] == [line[::2] for line in all_of_them["lines"]]
 
 
 def test_what_can_t_be_shown_is_told(record, tmp_path):
