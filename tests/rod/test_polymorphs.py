@@ -150,6 +150,17 @@ def test_joints_go_on_to_the_second_form_from_the_root(device):
     found = forms(sim)
     assert found[0] == 2 and (np.diff(found) <= 0).all()
     assert (found == 2).sum() > 3
+    # No further joint goes on once its interval is over, though the motor still winds up.
+    ended = Simulation(scene, device=device)
+    second = ended.system.model.data.polymorphs.second
+    intervals = np.zeros_like(second.numpy())
+    intervals[0] = begin, begin + 5e-4
+    second.assign(intervals)
+    ended.advance(begin + 6e-4)
+    last = forms(ended).copy()
+    assert 0 < (last == 2).sum() < (found == 2).sum()
+    ended.advance(begin + 2e-3)
+    np.testing.assert_array_equal(forms(ended) == 2, last == 2)
     other = Simulation(cell({**HELD, **values}), device=device)
     other.advance(begin + 3e-3)
     assert forms(other).max() == 1
