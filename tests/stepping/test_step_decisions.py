@@ -121,13 +121,14 @@ def test_steps_of_one_level_settle_where_they_err_by_what_is_kept(cell, kind):
     # A step cut to end on a target leaves the one wanted after it as it was, though the level has risen by then.
     assert cell(6e-6, 1.3 * k * 6e-6**3)
     assert cell.value("wanted_step") == pytest.approx(1e-5, rel=TOLERANCE)
-    # A level four times as high asks for shorter steps, a little more with each, until they err as before.
+    # A level four times as high asks for shorter steps, a little more with each, until they err as before; where errors
+    # add up, what was too much is made up for meanwhile by steps that are shorter still.
     lengths = []
     for _ in range(600):
         assert cell(dt, 4 * k * dt**3)
         dt = cell.value("wanted_step")
         lengths.append(dt)
-    assert lengths == sorted(lengths, reverse=True) and lengths[0] > 8e-6
+    assert lengths[0] > 7e-6 and (kind == "systematic" or lengths == sorted(lengths, reverse=True))
     assert 4 * k * dt**3 == pytest.approx(0.8 * allowed(kind, dt), rel=1e-2) and dt < 6e-6
 
 
