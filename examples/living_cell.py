@@ -20,7 +20,7 @@ from warpflag.view.coloring import FORM_COLORS
 
 HERE = Path(__file__).parent
 SMOOTHING = 0.05  # s, longer than a turn of the body
-MOMENTS = (0.0, 0.007, 0.009, 0.012, 0.016, 0.06)  # s, of the pictures of a filament that wraps
+MOMENTS = (0.0, 0.014, 0.02, 0.028, 0.034, 0.06)  # s, of the pictures of a filament that wraps
 TORQUES = (3.4, 3.2, 3.0, 2.7, 2.0)  # of the second motor [pN um]; the first has 3.4
 
 options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

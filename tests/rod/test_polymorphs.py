@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from warpflag.model import switching
 from warpflag.observables import power_balance
 from warpflag.record import Record
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import Scene, with_values
+from warpflag.scene import Scene, load, with_values
 
 A = 3.5
 NORMAL, SEMICOILED = np.array([0.0, 1.3, -2.1]), np.array([0.0, 2.84, 2.29])
@@ -87,6 +89,33 @@ def test_a_front_stops_where_the_moment_has_fallen_to_the_threshold_if_the_forms
         found = grown(-torque, device, 2e-2, **COLLINEAR, **{"hydrodynamics.mode": "consistent"})
         assert abs(found.mean() - (1.0 - 0.4 / torque)) < 0.05
         assert np.abs(np.diff(found)).sum() == 1
+
+
+REAL_HOOK = {"hook.stiffness": 0.65, "hydrodynamics.mode": "consistent", "polymorphs.ramp": 1e-3}
+
+
+@pytest.mark.parametrize("torque, expected", [(1.05, 0.0), (1.26, 0.72), (3.4, 0.90)])
+def test_a_front_of_semicoiled_form_runs_as_far_as_the_moment_allows(torque, expected, device):
+    """1 - 0.35/T of the filament, nothing below the threshold of nucleation, on a hook as soft as a real one."""
+    found = grown(-torque, device, 6e-2, **REAL_HOOK)
+    assert abs(found.mean() - expected) < 0.05
+    assert np.abs(np.diff(found)).sum() == (expected > 0.0)
+
+
+def test_a_fast_front_stops_after_one_turn_of_the_new_form_where_the_filament_has_a_kink(device):
+    """Whatever the length: after 1.72 um, from where on the outer part stands across the axis; to 0.5 um."""
+    for length in (6.0, 10.0):
+        found = grown(-1.26, device, 3e-2, **{**REAL_HOOK, "polymorphs.ramp": 2e-4, "flagella.length": length})
+        assert abs(0.2 * found.sum() - 2 * np.pi / np.linalg.norm(SEMICOILED)) < 0.5
+
+
+def test_a_free_cell_changes_the_form_of_its_filament_and_back(device):
+    """The shipped reversal, at the stall torque of a motor."""
+    sim = Simulation(load(Path(__file__).parents[2] / "examples" / "reversal.toml"), device=device)
+    sim.advance(0.06)
+    assert abs(forms(sim).mean() - 0.72) < 0.05
+    sim.advance(0.1)
+    assert forms(sim).sum() == 0
 
 
 def test_a_filament_in_the_target_form_goes_back_above_the_other_threshold(device):

@@ -230,7 +230,7 @@ class Polymorphs(Section, key="polymorphs"):
     nucleation_back: float = number(0.4, "pN um", -1e3, 1e3, "moment the other way at which it flips back")
     propagation: float = number(0.4, "pN um", -1e3, 1e3, "moment at which a joint beside the target flips to it")
     propagation_back: float = number(0.3, "pN um", -1e3, 1e3, "moment below which one beside the other form flips back")
-    ramp: float = number(2e-4, "s", 1e-6, 1, "time in which the ground state of a joint changes")
+    ramp: float = number(1e-3, "s", 1e-6, 1, "time in which the ground state of a joint changes")
 
 
 @dataclass(frozen=True)
