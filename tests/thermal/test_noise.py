@@ -159,6 +159,11 @@ def test_velocities_have_the_covariance_of_the_mobility(device):
     in_body = np.hstack([bodies[:, :3] @ turn, bodies[:, 3:] @ turn])
     exact = np.array([body.across, body.across, body.along, body.tumble, body.tumble, body.spin])
     assert np.all(abs(in_body.var(axis=0) / (scale * exact) - 1) < three_errors)
+    # Spins and the parts of the body's motion are independent of each other and of the nodes.
+    drawn = np.hstack([in_body, spins, nodes])
+    correlated = np.corrcoef(drawn.T)[: in_body.shape[1] + spins.shape[1]]
+    np.fill_diagonal(correlated, 0.0)
+    assert np.abs(correlated).max() < 5 / (count * draws) ** 0.5
 
 
 def test_drift_is_the_divergence_of_the_mobility(precision, device):

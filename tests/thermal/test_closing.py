@@ -1,0 +1,59 @@
+"""Contacts of a thermal step: their closest points where the step leads, as a linear step from the start sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+from warpflag_kernels.contact import contact_list, search
+from warpflag_kernels.implicit import delassus, quasi_newton
+from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.thermal import additive_chart, closing
+
+from tests.helpers import anchors, shaken, touching_cell
+from tests.oracles import segment_distances
+from warpflag.run.simulation import Simulation
+
+TOLERANCE = {"float64": 1e-12, "float32": 1e-6}  # of a gap [um]
+
+
+def test_gaps_where_a_step_leads_are_those_of_the_linear_step_from_the_start(precision, device):
+    warm = {"numerics.stepper": "implicit", "fluid.temperature": 300.0, "flagella.length": 1.0}
+    scene = touching_cell(warm, precision)
+    sim = Simulation(scene, device=device, starts=shaken(scene, 2, node=1e-3))
+    s, random = sim.system, np.random.default_rng(3)
+    model, state, pose = s.model, s.state, s.state.data.pose
+    contacts = contact_list.allocate(model, True)
+    law = delassus.allocate(model, contacts)
+    quasi_newton.allocate(model, contacts, law)
+    x = chain_chart.allocate(model)
+    nodes = 3e-3 * random.standard_normal((model.element_count, 4))
+    nodes[anchors(scene), :3] = 0.0
+    x.node.assign(nodes)  # the body rests
+    sim.evaluate()
+    state.data.active.fill_(1)
+    search.find(model, state, pose, contacts)
+    law.force.fill_(1.0)
+    start = pose.position.numpy().copy()
+    closing.renew(model, state, s.chart, x, additive_chart.allocate(model), contacts, law)
+    np.testing.assert_array_equal(pose.position.numpy(), start)
+    count = int(contacts.count.numpy()[0])
+    assert (law.force.numpy()[:count] == 0.0).all()
+
+    additive_chart.retract(model, state, s.chart, x, additive_chart.allocate(model))
+    end, axis = pose.position.numpy().astype(np.float64), pose.body_axis.numpy()[0].astype(np.float64)
+    names = ("segment", "other", "at", "at_other", "normal", "gap")
+    listed = (getattr(contacts, name).numpy()[:count] for name in names)
+    kinds, changes = set(), []
+    for e, j, at, at_other, normal, gap in zip(*listed, strict=True):
+        moved = at * nodes[e, :3] + (1 - at) * nodes[e - 1, :3]
+        if j >= 0:
+            moved = moved - at_other * nodes[j, :3] - (1 - at_other) * nodes[j - 1, :3]
+            p, q = end[[e - 1]], end[[j - 1]]
+            there = segment_distances(p, end[[e]] - p, q, end[[j]] - q)[0, 0]
+        else:
+            half = (scene.body.length - scene.body.width) / 2
+            off = end[e] - np.clip(end[e] @ axis, -half, half) * axis
+            there = np.linalg.norm(off) - scene.body.width / 2
+        kinds.add(j >= 0)
+        changes.append(normal @ moved)
+        assert abs(gap + changes[-1] - there) < TOLERANCE[precision]
+    assert kinds == {True, False} and np.max(np.abs(changes)) > 1e-3
