@@ -146,6 +146,10 @@ def test_a_mixed_cell_runs_as_the_explicit_stepper_says(device):
     [
         ({"hydrodynamics.mode": "all", "hydrodynamics.pair_radius": 0.02}, "0.0298 um is the least"),
         ({"hydrodynamics.mode": "within", "hydrodynamics.pair_radius": 0.02}, "0.0298 um is the least"),
+        (  # enough for the segments of 0.2 um, not for those of 0.25 um
+            {"hydrodynamics.mode": "all", "hydrodynamics.pair_radius": 0.033, "flagellum.1.segments": 8},
+            "0.0372 um is the least",
+        ),
         ({"hydrodynamics.mode": "consistent", "hydrodynamics.pair_radius": 0.015}, "um is the least"),
         (
             {

@@ -226,6 +226,21 @@ def test_the_mirrored_cell_changes_alike(device):
     assert np.abs(found[0].astype(int) - found[1]).sum() <= 1
 
 
+def test_forms_of_the_mirrored_filament_are_mirror_images(device, precision):
+    """Curvature across and twist change their signs, of the ground state and of both other forms."""
+    values = {**HELD, "polymorphs.semicoiled": (0.4, 2.84, 2.29), "polymorphs.second": "curly_1"}
+    strains = []
+    for own in ((0.3, 1.3, -2.1), (-0.3, 1.3, 2.1)):
+        sim = Simulation(cell({**values, "flagella.intrinsic_curvature": own}, precision), device=device)
+        strains.append(sim.system.model.data.polymorphs.rest_strain.numpy()[3:-3].reshape(-1, 3, 3))
+    np.testing.assert_allclose(strains[0] * [-1.0, 1.0, -1.0], strains[1], rtol=1e-6)
+    assert np.abs(strains[0][0, 0] - strains[0][0, 1]).min() > 0.01
+    h = sim.scenes[0].resolved_flagella()[0].segment_length
+    np.testing.assert_allclose(
+        strains[0][:, 1], np.tile(h * np.array([0.4, 2.84, 2.29]), (len(strains[0]), 1)), rtol=1e-6
+    )
+
+
 def test_both_steppers_see_the_ramps_alike(device):
     ends = []
     for stepper, step in (("implicit", 1e-6), ("rkc", 1e-6)):
