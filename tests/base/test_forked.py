@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 
 import pytest
@@ -37,10 +38,20 @@ def starter(tmp_path, monkeypatch):
     made.close()
 
 
+def soon(read):
+    """What a call returns that reads from a pipe, which has to be before half a minute is over."""
+    found = []
+    reader = threading.Thread(target=lambda: found.append(read()), daemon=True)
+    reader.start()
+    reader.join(30.0)
+    assert found, "nothing comes, and the pipe does not end"
+    return found[0]
+
+
 def ask(process, text):
     process.stdin.write(text + "\n")
     process.stdin.flush()
-    return process.stdout.readline()
+    return soon(process.stdout.readline)
 
 
 def test_processes_share_what_was_prepared_once_and_end_by_themselves(starter):
@@ -56,7 +67,7 @@ def test_processes_share_what_was_prepared_once_and_end_by_themselves(starter):
     second.send_signal(signal.SIGKILL)  # nobody is there any more
     third = starter.fork()
     third.stdin.close()  # of the end of its input a process learns, though others were forked meanwhile
-    assert third.wait() == 0 and third.stdout.read() == ""
+    assert third.wait() == 0 and soon(third.stdout.read) == ""
 
 
 def test_a_process_outlives_its_starter_and_the_starter_no_signal_but_its_end(starter):
@@ -69,7 +80,7 @@ def test_a_process_outlives_its_starter_and_the_starter_no_signal_but_its_end(st
     starter.close()
     assert ask(other, "still").startswith("still")
     other.stdin.close()
-    assert other.stdout.read() == "" and other.wait() == 1  # nobody knows any more
+    assert soon(other.stdout.read) == "" and other.wait() == 1  # nobody knows any more
 
 
 def test_a_starter_that_ended_is_an_error_of_the_machine(starter):

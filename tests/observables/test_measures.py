@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -315,3 +316,21 @@ def test_swimming_of_a_made_up_cell(made):
     assert found.body_power == pytest.approx(drag, rel=1e-3)
     with Record(made.directory) as record, pytest.raises(ValueError, match="two frames"):
         recorded.swimming(record, 2e-3, 2e-3)
+
+
+def test_motors_whose_torque_falls_work_by_the_mean_of_each_interval():
+    """Torque 4 - 2 s, rate 1 + s in the share s of 1 ms: a line and an angle that is a parabola, at uneven frames."""
+    share = np.array([0.0, 0.1, 0.4, 0.5, 1.0])
+    torque, angle = 4.0 - 2.0 * share, 6.0 * (share + share**2 / 2)
+    record = SimpleNamespace(
+        times=1e-3 * share,
+        observables={"motor_torque": np.stack([torque, 0 * torque], axis=1)},
+        motor_angle=np.stack([angle, angle], axis=1),
+    )
+    found = recorded.motor_torques(record, paper_scene("any"), slice(1, 4))
+    np.testing.assert_allclose(found[:, 0], [3.5, 3.1])
+    assert (found[:, 1] == 0.0).all() and found.shape == (2, 2)
+    whole = recorded.motor_torques(record, paper_scene("any"), slice(0, 5))
+    work = float((whole * np.diff(record.motor_angle, axis=0)).sum())
+    exact = 6.0 * (4.0 + 1.0 - 2.0 / 3.0)  # the integral of (4 - 2 s) 6 (1 + s)
+    assert work == pytest.approx(exact, rel=0.01)
