@@ -35,6 +35,7 @@ LIFE = 1.05
 """Times the undisturbed wall time of a command within which a signal comes: now and then it has ended before."""
 
 
+_PROBLEM = re.compile(r"warpflag: .+: .+")  # of a scene: its file, what is wrong
 _PROGRESS = re.compile(r"\s*\d+ %|.*compiling kernels")
 
 
@@ -106,8 +107,11 @@ def problem(ended: subprocess.CompletedProcess[str]) -> str:
         return f"traceback: {ended.stderr.strip().splitlines()[-1]}"
     if ended.returncode not in (0, 1, 2, 3, 130, 143):
         return f"status {ended.returncode}"
-    if ended.returncode in (1, 2) and len(told(ended)) != 1:
-        return f"status {ended.returncode} with {len(told(ended))} lines: {ended.stderr[-200:]}"
+    lines = told(ended)
+    if ended.returncode == 2 and lines and all(_PROBLEM.match(line) for line in lines):
+        return ""  # a line each
+    if ended.returncode in (1, 2) and len(lines) != 1:
+        return f"status {ended.returncode} with {len(lines)} lines: {ended.stderr[-200:]}"
     return ""
 
 
