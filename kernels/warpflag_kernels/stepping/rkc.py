@@ -42,7 +42,7 @@ FIRST_PROBES = 40  # iterations of the power method after a start, from a random
 # Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.01 to 0.8 of
 # what the accuracy allows (docs/numerics.md).
 ESTIMATE_SHARE = 0.1
-NOISE = 20.0  # an estimate below this times its usual round-off is taken to be round-off
+NOISE = 5.0  # an estimate below this times its usual round-off is taken to be round-off
 MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unstable, and the guards stop the cell
 
 

@@ -35,8 +35,8 @@ SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of w
 MEMORY = 20.0  # over how many steps that mean fades
 MEMORY_SYSTEMATIC = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
 # Shortest steps in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in water as
-# long as the windows for which errors are told (`accuracy.WINDOW`), in thinner fluids shorter.
-LOWERING = 5000.0
+# long as MEMORY_SYSTEMATIC, in thinner fluids shorter.
+LOWERING = 25000.0
 LOWEST = 1.0e-2  # of that rate, over what was asked: steps are then a tenth as long
 FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of its memory
 # If halving a rejected step leaves more than this fraction of its error, the velocity itself jumps (smooth: 1/8), and
@@ -145,7 +145,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             aim = control.error_rate[c]
             if wp.static(not independent):
                 if good and dt > control.shortest[c]:
-                    share = wp.where(error > lost, wp.min(error / most, rejection), wp.float64(0.0))
+                    share = wp.clamp((error - lost) / most, wp.float64(0.0), rejection)
                     lowered = control.lowered[c] * wp.exp((one - share) * dt / (lowering * control.shortest[c]))
                     control.lowered[c] = wp.clamp(lowered, lowest, one)
                 aim *= control.lowered[c]
