@@ -181,7 +181,7 @@ def test_a_hook_stiffens_by_the_torque_of_the_law_and_a_stopped_run_goes_on_with
     whole, first, second = (Simulation(scene, device=device, strict=True) for _ in range(3))
     for time in (1e-3, 1.2e-3):
         whole.advance(time)
-    torques = whole.system.state.data.motor.on_hook.numpy()
+    torques = whole.system.state.optional.motor.on_hook.numpy()
     assert np.abs(torques - whole.evaluate().motor_torques).max() < 0.02 < 0.3 < np.abs(torques - 1.26).max()
     first.advance(1e-3)
     second.restore(first.checkpoint())
@@ -201,8 +201,7 @@ def test_nonsense_is_refused_by_name():
 
 def test_without_stiffness_nothing_is_allocated_and_the_terms_are_those_of_before(device):
     bare = Simulation(cell({"hook.length": 0.055}), device=device).system.model
-    assert bare.data.hook.stiffness is None and "hook" not in [term.name for term in bare.terms]
+    assert bare.data.hook is None and "hook" not in [term.name for term in bare.terms]
     assert "hook" in [term.name for term in Simulation(cell(HOOK), device=device).system.model.terms]
     constant = Simulation(cell({**HOOK, "hook.stiffening_torque": 0.5}), device=device)
-    on_hook = constant.system.state.data.motor.on_hook
-    assert on_hook is None or on_hook.size == 0
+    assert constant.system.state.data.motor is None

@@ -134,7 +134,7 @@ def test_steppers_agree_and_their_work_balances(precision, device):
 
 def test_without_it_nothing_is_allocated_and_the_kernels_are_those_of_before(device):
     bare = Simulation(cell(), device=device).system.model
-    assert bare.data.external.force_per_length is None and bare.data.external.body_force is None
+    assert bare.data.external is None
     assert "external" not in [term.name for term in bare.terms]
     zero = cell({"external.force_per_length": (0.0, 0.0, 0.0)})
     assert Simulation(zero, device=device).system.model.switches == bare.switches

@@ -38,7 +38,7 @@ HELD = {
 
 def forms(sim: Simulation) -> np.ndarray:
     """Of the joints between segments."""
-    return sim.system.state.data.forms.form.numpy()[1:-1]
+    return sim.system.state.optional.forms.form.numpy()[1:-1]
 
 
 def flipped(moment: float, device: str, precision: str = "float64", values: dict | None = None) -> np.ndarray:
@@ -128,8 +128,8 @@ def test_a_filament_in_the_target_form_goes_back_above_the_other_threshold(devic
         anchor = attachment(scene, scene.resolved_flagella()[0])[0]
         start = placed(scene, [anchor + h * np.cumsum(frames[:, :, 2], axis=0)], [frames[:, :, 0]])
         sim = Simulation(scene, device=device, starts=start)
-        sim.system.state.data.forms.form.fill_(1)
-        sim.system.state.data.forms.before.fill_(1)
+        sim.system.state.optional.forms.form.fill_(1)
+        sim.system.state.optional.forms.before.fill_(1)
         sim.advance(5e-3)
         shares.append(forms(sim).mean())
     assert shares[0] == 1.0
@@ -288,7 +288,7 @@ def test_off_there_is_none_of_it(device):
     scene: Scene = with_values(cell({}), {})
     sim = Simulation(scene, device=device)
     assert not sim.system.model.timed
-    for array in (sim.system.state.data.forms.form, sim.system.model.data.polymorphs.rest_strain):
+    for array in (sim.system.state.data.forms, sim.system.model.data.polymorphs):
         assert array is None or array.size == 0
     assert "polymorphs" not in [term.name for term in sim.system.model.terms]
 

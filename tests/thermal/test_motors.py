@@ -48,7 +48,7 @@ def test_rates_on_a_curve_are_those_without_noise(device):
         before = turned(sim)
         sim.advance(end)
         rates.append(((turned(sim) - before) / (end - start)).mean(axis=1) / (2 * np.pi))
-        torques.append(sim.system.state.data.motor.torque.numpy())
+        torques.append(sim.system.state.optional.motor.torque.numpy())
     error = rates[0].std(ddof=1) / count**0.5
     assert error < 8.0
     assert abs(rates[0].mean() - rates[1].mean()) < ERRORS * error + 0.01 * rates[1].mean()  # a step of 1e-5 errs, too

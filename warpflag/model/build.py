@@ -10,7 +10,7 @@ import warp as wp
 from warpflag_kernels.base import clock, simd
 from warpflag_kernels.base.plan import Plan, choose_plan
 from warpflag_kernels.base.precision import Precision
-from warpflag_kernels.base.types import DeviceModel, DeviceState, allocate_state, structs
+from warpflag_kernels.base.types import DeviceModel, DeviceState, allocate_state, attach, optional, structs
 from warpflag_kernels.contact import neighbours
 from warpflag_kernels.fluid import rotne_prager, shell
 from warpflag_kernels.rod import comoving_chart
@@ -71,7 +71,7 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
     def vectors(values: Any) -> wp.array:
         return wp.array(np.asarray(values, dtype=np.float64), dtype=p.vec3, device=device)
 
-    m = structs(p).Model()
+    m, parts = structs(p).Model(), optional(structs(p).Model)
     m.cell_of, m.flagellum_of, m.first_node = ints(np.array(owner)[flagellum_of]), ints(flagellum_of), ints(first_node)
     m.first_flagellum = ints(np.concatenate([[0], np.cumsum(counts)]))
 
@@ -115,7 +115,8 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
 
     for term in SCENE_TERMS:
         if term.fill is not None and switches.has(term.name):
-            term.fill(scenes, p, device, m)
+            term.fill(scenes, p, device, m, parts)
+    attach(parts, m, device)
     return DeviceModel(
         plan=plan,
         switches=switches,
@@ -124,6 +125,7 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
         flagellum_count=len(flagella),
         element_count=len(flagellum_of),
         data=m,
+        optional=parts,
         groups=simd.build(p, m.first_flagellum.numpy(), m.first_node.numpy(), device),
         shells=shells_of(scenes) if switches.flows.body else None,
     )
@@ -132,7 +134,7 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
 def build_state(model: DeviceModel) -> DeviceState:
     """Device arrays of one evaluation of the right-hand side, zero; a term that is off gets none."""
     beads = shell.allocate(model, model.plan.pair_precision)
-    return DeviceState(allocate_state(model), rotne_prager.allocate(model), beads, neighbours.allocate(model))
+    return DeviceState(*allocate_state(model), rotne_prager.allocate(model), beads, neighbours.allocate(model))
 
 
 def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:

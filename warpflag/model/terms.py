@@ -33,18 +33,19 @@ class SceneTerm:
     Attributes:
         name: of the device term.
         needed: whether a scene has it.
-        fill: fills the struct `Model` of a batch, `fill(scenes, precision, device, data)`; None: nothing of its own.
+        fill: fills the struct `Model` of a batch and its optional parts,
+            `fill(scenes, precision, device, data, parts)`; None: nothing of its own.
         power: power that it brings into one cell [pN um/s], `power(scene, evaluation)`. None: it stores energy, or
             does no work.
     """
 
     name: str
     needed: Callable[[Scene], bool]
-    fill: Callable[[Sequence[Scene], Any, Any, Any], None] | None = None
+    fill: Callable[[Sequence[Scene], Any, Any, Any, Any], None] | None = None
     power: Callable[[Scene, Evaluation], float] | None = None
 
 
-def _fill_motor(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+def _fill_motor(scenes: Sequence[Scene], precision: Any, device: Any, data: Any, parts: Any) -> None:
     torques = [spec.torque for scene in scenes for spec in scene.resolved_flagella()]
     data.motor.torque = wp.array(np.array(torques), dtype=precision.real, device=device)
 
@@ -60,8 +61,8 @@ def _plain(scene: Scene) -> bool:
     return scene.motor.switching == "none" and all(spec.law == "constant" for spec in scene.resolved_flagella())
 
 
-def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
-    _fill_motor(scenes, precision, device, data)  # a hook that stiffens reads the torque
+def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: Any, parts: Any) -> None:
+    _fill_motor(scenes, precision, device, data, parts)  # a hook that stiffens reads the torque
     curves, tables = [], []
     specs = [(scene, k, spec) for scene in scenes for k, spec in enumerate(scene.resolved_flagella())]
     for scene, k, spec in specs:
@@ -74,7 +75,7 @@ def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: 
             curves.append((torque, 2 * math.pi * knee if falling else _NO_KNEE, slope))
         tables.append(corners(scene, k))
     device_array = functools.partial(wp.array, device=device)
-    m, real = data.motor, precision.real
+    m, real = parts.motor_law, precision.real
     m.curve = device_array(np.array(curves), dtype=precision.vec3)
     m.prescribed = device_array(np.array([spec.law == "rate" for _, _, spec in specs], dtype=np.int32), dtype=wp.int32)
     m.rate = device_array(np.array([2 * math.pi * spec.rate for _, _, spec in specs]), dtype=real)
@@ -84,7 +85,7 @@ def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: 
     m.switch_drive = device_array(np.concatenate([drives for _, drives in tables]), dtype=real)
 
 
-def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any, parts: Any) -> None:
     flagella = [(scene, spec) for scene in scenes for spec in scene.resolved_flagella()]
     rest = [
         rest_shape(
@@ -95,13 +96,13 @@ def _fill_hook(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) 
     limits = [scene.hook.stiffening_torque for scene, _ in flagella]
     stiffness = np.array([scene.hook.stiffness for scene, _ in flagella])
     stiffening = np.array([0.0 if limit is None else 1.0 / limit for limit in limits])
-    data.hook.stiffness = wp.array(stiffness, dtype=precision.real, device=device)
-    data.hook.stiffening = wp.array(stiffening, dtype=precision.real, device=device)
+    parts.hook.stiffness = wp.array(stiffness, dtype=precision.real, device=device)
+    parts.hook.stiffening = wp.array(stiffening, dtype=precision.real, device=device)
     axes = np.array([shape.helix_axes[:, 0] for shape in rest])
-    data.hook.helix_axis = wp.array(axes, dtype=precision.vec3, device=device)
+    parts.hook.helix_axis = wp.array(axes, dtype=precision.vec3, device=device)
 
 
-def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data: Any, parts: Any) -> None:
     own = data.rod.rest_strain.numpy().astype(np.float64)
     first = data.first_node.numpy()
     strains = np.repeat(own, 3, axis=0)
@@ -116,7 +117,7 @@ def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data:
                 strain *= (-1.0, 1.0, -1.0)
             strains[3 * first[k] + form : 3 * first[k + 1] : 3] = strain
     forms = [scene.polymorphs for scene, _, _ in specs]
-    m, pairs = data.polymorphs, functools.partial(wp.array, dtype=wp.vec2d, device=device)
+    m, pairs = parts.polymorphs, functools.partial(wp.array, dtype=wp.vec2d, device=device)
     m.rest_strain = wp.array(strains, dtype=precision.vec3, device=device)
     m.ramp = wp.array([f.ramp for f in forms], dtype=wp.float64, device=device)
     m.nucleation = pairs(np.array([(f.nucleation, -f.nucleation_back) for f in forms]))
@@ -131,10 +132,10 @@ def _external_forces(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return np.array(scene.external.force_per_length), np.array(scene.external.body_force)
 
 
-def _fill_external(scenes: Sequence[Scene], precision: Any, device: Any, data: Any) -> None:
+def _fill_external(scenes: Sequence[Scene], precision: Any, device: Any, data: Any, parts: Any) -> None:
     per_length, on_body = zip(*map(_external_forces, scenes), strict=True)
-    data.external.force_per_length = wp.array(np.array(per_length), dtype=precision.vec3, device=device)
-    data.external.body_force = wp.array(np.array(on_body), dtype=precision.vec3, device=device)
+    parts.external.force_per_length = wp.array(np.array(per_length), dtype=precision.vec3, device=device)
+    parts.external.body_force = wp.array(np.array(on_body), dtype=precision.vec3, device=device)
 
 
 def _external_power(scene: Scene, found: Evaluation) -> float:

@@ -175,11 +175,12 @@ def evaluation_of(system: System, scene: Scene, flagella: slice, nodes: slice) -
 def _ramp_power(system: System, flagella: slice, nodes: slice) -> float:
     """Rate at which ground states that change put energy into one cell at a pose that stands still [pN um/s]."""
     model, state = system.model.data, system.state.data
-    forms, own = state.forms, np.arange(nodes.start, nodes.stop)
+    forms, laws = system.state.optional.forms, system.model.optional.polymorphs
+    own = np.arange(nodes.start, nodes.stop)
     form, before = forms.form.numpy()[own], forms.before.numpy()[own]
-    rests = model.polymorphs.rest_strain.numpy().reshape(-1, 3, 3).astype(np.float64)[own]
+    rests = laws.rest_strain.numpy().reshape(-1, 3, 3).astype(np.float64)[own]
     of = model.flagellum_of.numpy()[own]
-    ramp = model.polymorphs.ramp.numpy()[of]
+    ramp = laws.ramp.numpy()[of]
     share = (state.time.numpy()[model.cell_of.numpy()[nodes.start]] - forms.changed.numpy()[own]) / ramp
     pace = np.where((share >= 0.0) & (share < 1.0), 6.0 * share * (1.0 - share), 0.0) / ramp
     rows = np.arange(len(own))
@@ -204,9 +205,9 @@ def _ramp_power(system: System, flagella: slice, nodes: slice) -> float:
 
 def motor_torques(system: System) -> np.ndarray:
     """Torques of all motors at the state evaluated last [pN um], shape [flagellum_count]."""
-    model, state = system.model, system.state.data
+    model = system.model
     if model.switches.has("motor law"):
-        return state.motor.torque.numpy().astype(np.float64)
+        return system.state.optional.motor.torque.numpy().astype(np.float64)
     if model.switches.has("motor"):
         return model.data.motor.torque.numpy().astype(np.float64)
     return np.zeros(model.flagellum_count)

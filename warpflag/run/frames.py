@@ -140,7 +140,7 @@ class Frames:
         before = {name: np.full_like(arrays[name], np.nan) for name in _MOTION}
         counts = np.ones(len(now.time), dtype=np.int64)
         torque = motor_torques(self._system)[None]  # of the present state, which was evaluated last
-        forms = self._system.state.data.forms.form.numpy()[None].copy() if self._polymorphs else np.zeros((1, 0))
+        forms = self._system.state.optional.forms.form.numpy()[None].copy() if self._polymorphs else np.zeros((1, 0))
         further = {"motor_torque": torque, "forms": forms, "before": before}
         block = _Block(counts=counts, steric_force=now.steric_force[None], **further, **arrays)
         return self._measured(block)

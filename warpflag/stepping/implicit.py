@@ -180,9 +180,9 @@ class ImplicitStepper:
         balance.weigh(model, state, x.total, self.balance)
         balance.add_up_ramps(model, state, s.chart, s.control, self.balance)
         # What was found is judged, and kept or dropped.
+        prediction.assess(model, state, s.control.step, self.steps.achieved.asked, i, self.balance)
         health.check(model, state, s.chart, s.guard, s.control, self.contacts if self._touching else None)
-        inputs = [model.data, state.data, band, self.contacts, self.law, s.chart, s.control, self.steps, i]
-        inputs.append(self.balance)
+        inputs = [band, self.contacts, self.law, state.data.active, s.chart, s.control, self.steps, i, self.balance]
         wp.launch(k.decide, model.cell_count, inputs=inputs, device=device)
         if self.dense is not None:
             dense_output.take(model, state, s.chart, s.control, self.dense, counted=True)
@@ -274,7 +274,7 @@ class ImplicitStepper:
         if self.stability is not None:
             kept |= {name: getattr(self.stability, name).numpy().copy() for name in _STABILITY_MEMORY}
         if self._motor_law:
-            kept["held_torque"] = self._system.state.data.motor.held.numpy().copy()
+            kept["held_torque"] = self._system.state.optional.motor.held.numpy().copy()
         for name, x in self._increments_kept().items():
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
@@ -284,7 +284,7 @@ class ImplicitStepper:
         for name, values in recalled(self.steps, memory).items():
             whose, _, part = name.partition("_")
             if name == "held_torque":
-                self._system.state.data.motor.held.assign(values)
+                self._system.state.optional.motor.held.assign(values)
             elif part in ("node", "body"):
                 getattr(kept[whose], part).assign(values)
             elif whose == "balance":

@@ -50,7 +50,7 @@ class System:
         if self.model.switches.steric:
             carried["guard.position"] = self.guard.position
         names = [name for term in self.model.terms for name in term.carried]
-        return carried | {name: attrgetter(name)(self.state.data) for name in names}
+        return carried | {name: attrgetter(name)(self.state.optional) for name in names}
 
 
 DEFAULT_ACCURACY = ACCURACY_LEVELS["standard"]

@@ -314,7 +314,7 @@ class ThermalStepper:
         if self.lanczos is not None:
             kept["noise_products"] = self.lanczos.data.total.numpy().copy()
         if self.motors is not None:
-            kept["held_torque"] = self._system.state.data.motor.held.numpy().copy()
+            kept["held_torque"] = self._system.state.optional.motor.held.numpy().copy()
             kept["average_rate"] = self.motors.average.numpy().copy()
         return kept
 
@@ -325,5 +325,5 @@ class ThermalStepper:
         if self.lanczos is not None:
             self.lanczos.data.total.assign(memory["noise_products"])
         if self.motors is not None:
-            self._system.state.data.motor.held.assign(memory["held_torque"])
+            self._system.state.optional.motor.held.assign(memory["held_torque"])
             self.motors.average.assign(memory["average_rate"])

@@ -56,7 +56,7 @@ class Term:
         after_step: changes the term's own state once a step has been accepted and committed, a part of a pass:
             `after_step(model, state, chart, control, counted)`, `counted` whether the clocks stand at its end already.
             None: it has no such state.
-        carried: arrays of that state, by their dotted names in `State`; checkpoints hold them.
+        carried: arrays of that state, by their dotted names in `DeviceState.optional`; checkpoints hold them.
     """
 
     name: str

@@ -47,7 +47,11 @@ def structs(p: Precision) -> SimpleNamespace:
         torque: wp.array(dtype=real)  # T_m [pN um]
         axis: wp.array(dtype=vec3)  # m
         anchor: wp.array(dtype=vec3)  # r_0 [um]
-        # Where the torque is not constant, see motor/laws.py.
+
+    @wp.struct
+    class MotorLaw:
+        """Where the torque is not constant, see motor/laws.py; per flagellum [K] unless said otherwise."""
+
         curve: wp.array(dtype=vec3)  # [2 K], forward and reverse: plateau [pN um], knee [rad/s], slope [pN um s]
         prescribed: wp.array(dtype=wp.int32)  # 1: the rate is prescribed, not the torque
         rate: wp.array(dtype=real)  # that rate, relative to the body [rad/s]
@@ -127,13 +131,16 @@ def structs(p: Precision) -> SimpleNamespace:
         first_flagellum: wp.array(dtype=wp.int32)  # [C + 1]
         rod: Rod
         motor: Motor
-        hook: Hook
-        polymorphs: Polymorphs
         drag: Drag
         pairs: Pairs
         steric: Steric
         body: Body
-        external: External
+        # Of terms that a scene may do without: arrays of one struct, empty without the term, so that a launch, which
+        # passes on every array of its arguments, has one more for each of them and not one for each of their arrays.
+        motor_law: wp.array(dtype=MotorLaw)
+        hook: wp.array(dtype=Hook)
+        polymorphs: wp.array(dtype=Polymorphs)
+        external: wp.array(dtype=External)
 
     @wp.struct
     class Pose:
@@ -167,8 +174,8 @@ def structs(p: Precision) -> SimpleNamespace:
     class State:
         pose: Pose
         time: wp.array(dtype=wp.float64)  # [C], of the evaluation [s]; only where something depends on it
-        motor: MotorState
-        forms: Forms
+        motor: wp.array(dtype=MotorState)  # one, or none, as in `Model`
+        forms: wp.array(dtype=Forms)
         active: wp.array(dtype=wp.int32)  # [C], 1: the cell takes part in this pass
         # Joint i couples segments i and i + 1: energy gradients with respect to the two segment vectors and spins.
         joint_before: wp.array(dtype=vec3)  # [E] [pN]; of the hook with respect to the unit vector m [pN um]
@@ -204,6 +211,7 @@ class DeviceModel:
         terms: force terms in their order, instances of `Term`.
         cell_count, flagellum_count, element_count: sizes C, K, E.
         data: the struct `Model`.
+        optional: structs of terms that a scene may do without, by their names in `Model`, as in `optional`.
         groups: the struct `Groups`: flagella side by side in vector lanes.
         shells: beads of the bodies on the host, `warpflag_kernels.fluid.shell.Shells`; None without body flow.
     """
@@ -215,6 +223,7 @@ class DeviceModel:
     flagellum_count: int
     element_count: int
     data: Any
+    optional: SimpleNamespace
     groups: Any
     shells: Any = None
 
@@ -243,12 +252,14 @@ class DeviceState:
 
     Attributes:
         data: the struct `State`.
+        optional: structs of terms that a scene may do without, by their names in `State`, as in `optional`.
         pairs: the struct `PairSum` of the Rotne-Prager sum.
         shell: the struct `Shell` of the flow round the body.
         neighbours: the struct `Neighbours` of the steric force.
     """
 
     data: Any
+    optional: SimpleNamespace
     pairs: Any
     shell: Any
     neighbours: Any
@@ -264,8 +275,24 @@ def allocate_pose(p: Precision, cell_count: int, element_count: int, device: Any
     pose.body_axis = wp.zeros(cell_count, dtype=p.vec3, device=device)
 
 
-def allocate_state(model: DeviceModel) -> Any:
-    """Arrays of the struct `State`, zero; a term that is off gets none."""
+def optional(whole: Any) -> SimpleNamespace:
+    """Structs of the terms that a scene may do without, by their names in the struct `Model` or `State`, no array set.
+
+    A kernel reads them by way of arrays of one struct, which the host cannot look into: it keeps them beside the whole.
+    """
+    kinds = {name: var.type.dtype for name, var in whole.vars.items() if isinstance(var.type, wp.array)}
+    return SimpleNamespace(**{name: kind() for name, kind in kinds.items() if hasattr(kind, "vars")})
+
+
+def attach(parts: SimpleNamespace, data: Any, device: Any) -> None:
+    """Puts the structs of `optional` that have arrays where kernels find them, in arrays of one in `data`."""
+    for name, part in vars(parts).items():
+        if any(getattr(part, field) is not None for field in part._cls.vars):
+            setattr(data, name, wp.array([part], dtype=part._cls, device=device))
+
+
+def allocate_state(model: DeviceModel) -> tuple[Any, SimpleNamespace]:
+    """Arrays of the struct `State`, zero, and its optional parts; a term that is off gets none."""
     p, device = model.precision, model.device
     cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
 
@@ -288,13 +315,15 @@ def allocate_state(model: DeviceModel) -> Any:
     s.body_velocity, s.body_spin = zeros(cells, p.vec3), zeros(cells, p.vec3)
     if model.timed:
         s.time = zeros(cells, wp.float64)
+    parts = optional(structs(p).State)
     if model.switches.has("motor law"):
         for name in ("torque", "held", "slope"):
-            setattr(s.motor, name, zeros(flagella, p.real))
+            setattr(parts.motor, name, zeros(flagella, p.real))
         if model.switches.has("hook that stiffens"):
-            s.motor.on_hook = wp.clone(model.data.motor.torque)
+            parts.motor.on_hook = wp.clone(model.data.motor.torque)
     if model.switches.has("polymorphs"):
-        s.forms.form, s.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
-        s.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
-        s.forms.rest_strain = model.data.rod.rest_strain
-    return s
+        parts.forms.form, parts.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
+        parts.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
+        parts.forms.rest_strain = model.data.rod.rest_strain
+    attach(parts, s, device)
+    return s, parts

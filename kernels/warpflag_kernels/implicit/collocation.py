@@ -77,7 +77,9 @@ def struct(p: Precision) -> Any:
         predictor_error: wp.array(dtype=real)  # [K], predictor error: sum over the nodes of |e - predicted e| [um]
         along: wp.array(dtype=real)  # [K], sum over the nodes of e . predicted e [um^2]
         predicted: wp.array(dtype=real)  # [K], sum over the nodes of |predicted e|^2 [um^2]
+        error: wp.array(dtype=wp.float64)  # estimate of the step [um]
         share: wp.array(dtype=wp.float64)  # of predicted e in e of the last step, by least squares, from 0 to 1
+        share_after: wp.array(dtype=wp.float64)  # the same of the present step
         begun: wp.array(dtype=wp.float64)  # share of predicted e that this step begins with
         awaited: wp.array(dtype=wp.float64)  # share of predicted e that gaps are predicted with beyond that
         accepted: wp.array(dtype=wp.int32)
@@ -91,7 +93,7 @@ def allocate(model: DeviceModel) -> Any:
     p, device = model.precision, model.device
     i = struct(p)()
     floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "reach")
-    for name in (*floats, "curvature", "share", "begun", "awaited"):
+    for name in (*floats, "curvature", "error", "share", "share_after", "begun", "awaited"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
     for name in ("history", "accepted", "evaluations"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
@@ -112,15 +114,12 @@ def kernels(p: Precision) -> SimpleNamespace:
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     drag = block_band.functions(p).drag
     f = step_control.functions(p, independent=True)
-    allowed, asked, accept, next_step, smallest = f.allowed, f.asked, f.accept, f.next_step, f.smallest
+    allowed, accept, next_step, smallest = f.allowed, f.accept, f.next_step, f.smallest
     add_estimate = accuracy.functions(independent=True).add
     advanced = clock.functions().advanced
     module = p.module("collocation")
-    Balance, keeps, counted = balance.struct(p), balance.functions(p).kept, balance.functions(p).count
-    round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
-    theta_inside, per_predictor, whole_up_to = (
-        wp.constant(wp.float64(x)) for x in (THETA, ERROR_PER_PREDICTOR, BEGUN_WHOLE)
-    )
+    Balance, counted = balance.struct(p), balance.functions(p).count
+    theta_inside, whole_up_to = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(BEGUN_WHOLE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
     unsolved, inaccurate, unbalanced = (
         wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE)
@@ -274,13 +273,11 @@ def kernels(p: Precision) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def decide(
-        # Model:
-        model: Model,
         # State:
-        state: State,
         band: Band,
         contacts_in: Contacts,
         law: Law,
+        active: wp.array(dtype=wp.int32),
         # Out:
         chart: Chart,
         control: Control,
@@ -289,26 +286,14 @@ def kernels(p: Precision) -> SimpleNamespace:
         powers: Balance,
     ):
         c = wp.tid()
-        if state.active[c] == 0:
+        if active[c] == 0:
             return
         dt = control.step[c]
-        predictor_error = wp.float64(0.0)
-        k = model.first_flagellum[c]
-        along = wp.float64(0.0)
-        squared = wp.float64(0.0)
-        while k < model.first_flagellum[c + 1]:
-            nodes = model.first_node[k + 1] - model.first_node[k] - 1
-            predictor_error = wp.max(predictor_error, wp.float64(imp.predictor_error[k]) / wp.float64(nodes))
-            along += wp.float64(imp.along[k])
-            squared += wp.float64(imp.predicted[k])
-            k += 1
-        theta = imp.theta[c]
-        truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
-        error = per_predictor * truncated * predictor_error
+        error = imp.error[c]
         sound = band.singular[c] == 0 and law.failed[c] == 0 and contacts_in.overflow[c] == 0
         sound = sound and control.fault[c] == no_fault and wp.isfinite(error)
         lasts = bool(False)
-        kept, energy = keeps(model, powers, c, dt, wp.max(round_off, asked(steps, c, dt)))
+        kept = powers.kept[c] != 0
         if sound and powers.known[c] != 0:
             lasts = counted(powers, c, kept)
         sound = sound and kept
@@ -316,12 +301,10 @@ def kernels(p: Precision) -> SimpleNamespace:
         if accept(steps, c, dt, error, wp.float64(0.0), sound, known):
             if known and add_estimate(steps.achieved, c, dt, error, advanced(control, c), steps.shortest[c]):
                 control.fault[c] = inaccurate
-            powers.stored[c] = energy
+            powers.stored[c] = powers.stored_after[c]
             powers.known[c] = 1
             imp.accepted[c] = 1
-            imp.share[c] = wp.float64(0.0)
-            if squared > wp.float64(0.0):
-                imp.share[c] = wp.clamp(along / squared, wp.float64(0.0), wp.float64(1.0))
+            imp.share[c] = imp.share_after[c]
             imp.step_before[c] = imp.last_step[c]
             imp.last_step[c] = dt
             imp.history[c] = wp.min(imp.history[c] + 1, 2)

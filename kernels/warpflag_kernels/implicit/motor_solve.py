@@ -99,7 +99,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         """`settled` of motor k, by its average rate if the law asks for that."""
         share = one
         known = zero
-        if model.motor.prescribed[k] == 0:
+        if model.motor_law[0].prescribed[k] == 0:
             share = share_of(band, motors, c)
             known = (one - share) * motors.average[k]
         torque, softness, slope = settled(model, k, drive, share * mobility, share * passive_rate + known)
@@ -192,16 +192,16 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
             while k < end:
                 mobility = per_step * motors.answer.node[model.first_node[k]][3]
                 free = motors.free_rate[k] + per_step * wp.dot(motors.by_body[k], moved)
-                passive_rate = free - mobility * state.motor.held[k]
+                passive_rate = free - mobility * state.motor[0].held[k]
                 drive = drive_at(model, k, state.time[c])
                 if wp.static(averaged):
                     torque, softness, slope = law_of(model, band, motors, k, c, drive, mobility, passive_rate)
                 else:
                     torque, softness, slope = settled(model, k, drive, mobility, passive_rate)
-                if slope != state.motor.slope[k]:
+                if slope != state.motor[0].slope[k]:
                     changed = True
-                state.motor.slope[k] = slope
-                motors.change[k] = torque - state.motor.held[k]
+                state.motor[0].slope[k] = slope
+                motors.change[k] = torque - state.motor[0].held[k]
                 remaining -= motors.change[k] * motors.on_body[k]
                 jacobian += wp.outer(motors.on_body[k], (softness * per_step) * motors.by_body[k])
                 k += 1
@@ -213,8 +213,8 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         motors.moved[c] = g * moved
         k = begin
         while k < end:
-            state.motor.held[k] = state.motor.held[k] + motors.change[k]
-            state.motor.torque[k] = state.motor.held[k]
+            state.motor[0].held[k] = state.motor[0].held[k] + motors.change[k]
+            state.motor[0].torque[k] = state.motor[0].held[k]
             k += 1
 
     @wp.kernel(module=module)

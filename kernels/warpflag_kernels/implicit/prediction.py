@@ -1,9 +1,11 @@
-"""The prediction of a step: what the last two increments let one expect of it, and how much of that it begins with.
+"""The prediction of a step: what the last two increments let one expect of it, how much of that it begins with, and
+what it tells of the step in the end.
 
 A quadratic path through the last three states says what the correction e of a step would be (`collocation`). The first
 iteration begins with a share of it, at the pose R(q, theta w delta + share e): what two iterations leave of the slowly
 converging modes is in proportion to the e that is not known yet, of third order in the step instead of second. The
-share is that of the last step, by least squares over its nodes, and less where the over-implicitness is large.
+share is that of the last step, by least squares over its nodes, and less where the over-implicitness is large. How far
+a step ends from its prediction is what the error estimate follows from.
 """
 
 import functools
@@ -16,6 +18,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.implicit import collocation
 from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.stepping import accuracy, balance, step_control
 
 
 @functools.cache
@@ -23,6 +26,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Implicit, Increment = collocation.struct(p), chain_chart.types(p).Increment
+    Balance, judge = balance.struct(p), balance.functions(p).judge
+    may_make = accuracy.functions(independent=True).may_make
+    per_predictor = wp.constant(wp.float64(collocation.ERROR_PER_PREDICTOR))
+    round_off = wp.constant(wp.float64(step_control.ROUND_OFF[p.name]))
     module = p.module("prediction")
 
     @wp.kernel(module=module)
@@ -77,7 +84,43 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if e == model.first_node[model.first_flagellum[c]]:
             found.body[c] = begun * predicted.body[c] + x.body[c]
 
-    return SimpleNamespace(predict=predict, join=join)
+    @wp.kernel(module=module)
+    def assess(
+        # Model:
+        first_flagellum: wp.array(dtype=wp.int32),
+        first_node: wp.array(dtype=wp.int32),
+        # State:
+        active: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.float64),
+        asked: wp.array(dtype=wp.float64),
+        # Out:
+        imp: Implicit,
+        powers: Balance,
+    ):
+        """What a step's flagella tell of it: its error, the share of its prediction, and its power balance."""
+        c = wp.tid()
+        if active[c] == 0:
+            return
+        dt = step[c]
+        predictor_error = wp.float64(0.0)
+        along = wp.float64(0.0)
+        squared = wp.float64(0.0)
+        k = first_flagellum[c]
+        while k < first_flagellum[c + 1]:
+            nodes = first_node[k + 1] - first_node[k] - 1
+            predictor_error = wp.max(predictor_error, wp.float64(imp.predictor_error[k]) / wp.float64(nodes))
+            along += wp.float64(imp.along[k])
+            squared += wp.float64(imp.predicted[k])
+            k += 1
+        theta = imp.theta[c]
+        truncated = wp.float64(1.5) * theta * theta - wp.float64(0.5)
+        imp.error[c] = per_predictor * truncated * predictor_error
+        imp.share_after[c] = wp.float64(0.0)
+        if squared > wp.float64(0.0):
+            imp.share_after[c] = wp.clamp(along / squared, wp.float64(0.0), wp.float64(1.0))
+        judge(first_flagellum, powers, c, dt, wp.max(round_off, may_make(asked[c], dt)))
+
+    return SimpleNamespace(predict=predict, join=join, assess=assess)
 
 
 def predict(
@@ -108,3 +151,17 @@ def join(model: DeviceModel, state: DeviceState, data: Any, predicted: Any, x: A
     """
     inputs = [model.data, state.data, data, predicted, x, found]
     wp.launch(_kernels(model.precision).join, model.element_count, inputs=inputs, device=model.device)
+
+
+def assess(model: DeviceModel, state: DeviceState, step: Any, asked: Any, data: Any, powers: Any) -> None:
+    """Error estimate, share of the prediction and power balance of a step that has been completed, by cell.
+
+    Args:
+        model, state: of the batch.
+        step: its length [s], shape [cell_count].
+        asked: error per simulated time that the accuracy asks for [um/s], shape [cell_count].
+        data: struct `Implicit`.
+        powers: struct `Balance`, weighed.
+    """
+    inputs = [model.data.first_flagellum, model.data.first_node, state.data.active, step, asked, data, powers]
+    wp.launch(_kernels(model.precision).assess, model.cell_count, inputs=inputs, device=model.device)

@@ -73,6 +73,10 @@ def struct(p: Precision) -> Any:
         stored: wp.array(dtype=wp.float64)
         full: wp.array(dtype=wp.float64)
         local: wp.array(dtype=wp.float64)
+        # Rates of the longest mode of the flagellum in which it relaxes fastest [1/s].
+        bending_rate: wp.array(dtype=wp.float64)
+        stretching_rate: wp.array(dtype=wp.float64)
+        quotient: wp.array(dtype=wp.float64)  # the Rayleigh quotient of the probe, times the over-implicitness
 
     return Stability
 
@@ -82,17 +86,35 @@ def allocate(model: DeviceModel) -> Any:
     every cell."""
     cells, device = model.cell_count, model.device
     s = struct(model.precision)()
-    s.kappa = wp.zeros(cells, dtype=wp.float64, device=device)
+    s.kappa, s.quotient = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(2))
     for name in ("size", "stored", "full", "local"):
         setattr(s, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
     s.measured, s.active, s.strong = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(3))
     # Conditional kernels load in the first pass, which takes no step.
     s.due, s.any_strong = (wp.ones(1, dtype=wp.int32, device=device) for _ in range(2))
     nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+    bending, stretching = _relaxation_rates(model)
+    s.bending_rate = wp.array(bending, dtype=wp.float64, device=device)
+    s.stretching_rate = wp.array(stretching, dtype=wp.float64, device=device)
     probe = chain_chart.allocate(model)
     probe.node.assign(np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes]))
     s.probe = probe
     return s
+
+
+def _relaxation_rates(model: DeviceModel) -> tuple[np.ndarray, np.ndarray]:
+    """Rates at which the longest bending and stretching modes relax, the largest of a cell's flagella [1/s], shape [C].
+
+    With the local mobility: A q^4 mu_across per length with q L the first root `FREE_ROD`, and K (pi/L)^2 mu_along of a
+    half wave.
+    """
+    first_node, first_flagellum = model.data.first_node.numpy(), model.data.first_flagellum.numpy()[:-1]
+    rod, drag, first = model.data.rod, model.data.drag, first_node[:-1] + 1
+    a, k, h = (x.numpy().astype(float) for x in (rod.bending_rigidity, rod.stretching_stiffness, rod.segment_length))
+    across, along = (x.numpy()[first].astype(float) for x in (drag.mobility_across, drag.mobility_along))
+    length = (np.diff(first_node) - 1) * h
+    bending, stretching = a * h * across * (FREE_ROD / length) ** 4, k * h * along * (math.pi / length) ** 2
+    return np.maximum.reduceat(bending, first_flagellum), np.maximum.reduceat(stretching, first_flagellum)
 
 
 @functools.cache
@@ -106,46 +128,22 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     long_interval, first_of_flexible = wp.constant(LONG_INTERVAL), wp.constant(FIRST_OF_FLEXIBLE)
     large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
     large_kappa_of_stiff = wp.constant(wp.float64(0.0 if body_flow else LARGE_KAPPA))
-    half_turn, tight = wp.constant(real(math.pi)), wp.constant(wp.float64(TIGHT))
-    free_rod, relaxed = wp.constant(real(FREE_ROD**2)), wp.constant(wp.float64(RELAXED))
+    tight, relaxed = wp.constant(wp.float64(TIGHT)), wp.constant(wp.float64(RELAXED))
     least, most, share, fall = (
         wp.constant(wp.float64(x)) for x in (LEAST, MOST, OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL)
     )
 
     @wp.func(module=module)
-    def rod_like(model: Model, c: wp.int32, step: wp.float64):
+    def rod_like(stability: Stability, c: wp.int32, step: wp.float64):
         """Whether the longest bending mode of some flagellum relaxes within some ten steps."""
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            first = model.first_node[k]
-            h = model.rod.segment_length[k]
-            length = real(model.first_node[k + 1] - first - 1) * h
-            squared = free_rod / (length * length)
-            rate = model.rod.bending_rigidity[k] * h * model.drag.mobility_across[first + 1] * squared * squared
-            if step * wp.float64(rate) > relaxed:
-                return True
-            k += 1
-        return False
+        return step * stability.bending_rate[c] > relaxed
 
     @wp.func(module=module)
-    def taut(model: Model, c: wp.int32, step: wp.float64):
-        """Whether the longest stretching mode of some flagellum, a half wave, relaxes within a tenth of a step."""
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            first = model.first_node[k]
-            h = model.rod.segment_length[k]
-            wave = half_turn / (real(model.first_node[k + 1] - first - 1) * h)
-            rate = model.rod.stretching_stiffness[k] * h * model.drag.mobility_along[first + 1] * wave * wave
-            if step * wp.float64(rate) > tight:
-                return True
-            k += 1
-        return False
-
-    @wp.func(module=module)
-    def weakly_coupled(model: Model, c: wp.int32, longest_step: wp.float64):
+    def weakly_coupled(model: Model, stability: Stability, c: wp.int32, longest_step: wp.float64):
         """Whether kappa is small at any time: one or two flagella that are flexible in the longest step."""
         few = model.first_flagellum[c + 1] - model.first_flagellum[c] <= 2
-        return few and not rod_like(model, c, longest_step) and not taut(model, c, longest_step)
+        taut = longest_step * stability.stretching_rate[c] > tight
+        return few and not rod_like(stability, c, longest_step) and not taut
 
     @wp.kernel(module=module)
     def schedule(
@@ -163,7 +161,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         stability.active[c] = state.active[c]
         measured = int(0)
         due = accepted[c] == 0
-        if weakly_coupled(model, c, longest_step[c]) and stability.kappa[c] <= large_kappa:
+        if weakly_coupled(model, stability, c, longest_step[c]) and stability.kappa[c] <= large_kappa:
             due = due or steps[c] % long_interval == first_of_flexible
         else:
             due = due or steps[c] < first_measurements or steps[c] % interval == 0
@@ -226,11 +224,22 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         stability.full[k] = wp.float64(full)
         stability.local[k] = wp.float64(local)
 
-    @wp.func(module=module)
-    def quotient(
-        model: Model, state: State, stability: Stability, c: wp.int32, dt: wp.float64, g: wp.float64, w: wp.float64
+    @wp.kernel(module=module)
+    def divide(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        step: wp.array(dtype=wp.float64),
+        gain: wp.array(dtype=wp.float64),
+        over_implicit: wp.array(dtype=wp.float64),
+        # Out:
+        stability: Stability,
     ):
-        """The Rayleigh quotient of the probe, times the over-implicitness w."""
+        """The Rayleigh quotient of the probe, from what `dissipate` found; a kernel of its own for its registers."""
+        c = wp.tid()
+        if stability.measured[c] == 0:
+            return
         stored = wp.float64(0.0)
         full = wp.float64(0.0)
         local = wp.float64(0.0)
@@ -246,11 +255,13 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             k += 1
         velocity, spin = respond(model, state, c, force, torque)
         local += wp.float64(wp.dot(force, velocity) + wp.dot(torque, spin))
+        dt = step[c]
+        w = over_implicit[c]
         # In soft modes of a filament under load x.H x may be negative, and then no stiffness is to be had from it.
-        denominator = stored / dt + w * g * local
-        if denominator <= wp.float64(0.0):
-            return w
-        return w * (stored / dt + g * full) / denominator
+        stability.quotient[c] = w
+        denominator = stored / dt + w * gain[c] * local
+        if denominator > wp.float64(0.0):
+            stability.quotient[c] = w * (stored / dt + gain[c] * full) / denominator
 
     @wp.kernel(module=module)
     def measure(
@@ -287,7 +298,6 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         # State:
         response: Increment,
         step: wp.array(dtype=wp.float64),
-        gain: wp.array(dtype=wp.float64),
         longest_step: wp.array(dtype=wp.float64),
         # Out:
         stability: Stability,
@@ -306,14 +316,14 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             k += 1
         ratio = wp.sqrt(total)
         if wp.isfinite(ratio) and ratio > wp.float64(0.0):
-            weak = weakly_coupled(model, c, longest_step[c])
+            weak = weakly_coupled(model, stability, c, longest_step[c])
             crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-            flexible = weak or (crowd and not rod_like(model, c, step[c]))
+            flexible = weak or (crowd and not rod_like(stability, c, step[c]))
             # The growth of a probe of any direction may exceed kappa by far: stiff cells are solved with the full
             # mobility until their probe has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]
             if weak:
-                kappa = wp.min(kappa, quotient(model, state, stability, c, step[c], gain[c], over_implicit[c]))
+                kappa = wp.min(kappa, stability.quotient[c])
             most_kappa = wp.where(flexible, large_kappa_of_flexible, large_kappa_of_stiff)
             stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
             if stability.strong[c] != 0:
@@ -330,7 +340,9 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
                 stability.probe.node[e] = scale * stability.probe.node[e]
                 e += 1
 
-    return SimpleNamespace(schedule=schedule, mask=mask, dissipate=dissipate, measure=measure, choose=choose)
+    return SimpleNamespace(
+        schedule=schedule, mask=mask, dissipate=dissipate, divide=divide, measure=measure, choose=choose
+    )
 
 
 def schedule(
@@ -377,8 +389,10 @@ def measure(
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
     inputs = [model.data, state.data, band, stability.probe, stability]
     wp.launch(kernels.dissipate, model.flagellum_count, inputs=inputs, device=device)
+    inputs = [model.data, state.data, band.step, gain, over_implicit, stability]
+    wp.launch(kernels.divide, model.cell_count, inputs=inputs, device=device)
     linearised.solve(model, state, band, response)
     inputs = [model.data, response, stability]
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
-    inputs = [model.data, response, band.step, gain, longest_step, stability, over_implicit, state.data]
+    inputs = [model.data, response, band.step, longest_step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)

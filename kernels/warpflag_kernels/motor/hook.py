@@ -39,17 +39,18 @@ def joint(p: Precision) -> SimpleNamespace:
         e = model.first_node[k] + 1
         t = state.pose.tangent[e]
         e1 = state.pose.director[e]
-        own = model.hook.helix_axis[k]
+        own = model.hook[0].helix_axis[k]
         return own[0] * e1 + own[1] * wp.cross(t, e1) + own[2] * t
 
     @wp.func(module=module)
     def stiffness(model: Model, state: State, k: wp.int32):
         """k of flagellum k [pN um/rad]."""
         torque = motor_torque(model, state, k)
-        if state.motor.on_hook.shape[0] > 0:
-            torque = state.motor.on_hook[k]
-        stiffening = model.hook.stiffening[k] * wp.abs(torque)
-        return model.hook.stiffness[k] * (real(1.0) + stiffening)
+        if state.motor.shape[0] > 0:  # noqa: SIM102 (a kernel evaluates both sides of an `and`)
+            if state.motor[0].on_hook.shape[0] > 0:
+                torque = state.motor[0].on_hook[k]
+        stiffening = model.hook[0].stiffening[k] * wp.abs(torque)
+        return model.hook[0].stiffness[k] * (real(1.0) + stiffening)
 
     @wp.func(module=module)
     def axis_rates(model: Model, state: State, k: wp.int32):
@@ -200,7 +201,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         k = wp.tid()
         c = model.cell_of[model.first_node[k]]
         if state.active[c] != 0 and chart.commit[c] != 0:
-            state.motor.on_hook[k] = state.motor.torque[k]
+            state.motor[0].on_hook[k] = state.motor[0].torque[k]
 
     return SimpleNamespace(energies=energies, add_stiffness=add_stiffness, follow=follow)
 

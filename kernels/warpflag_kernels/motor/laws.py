@@ -47,29 +47,30 @@ def curves(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def drive_at(model: Model, k: wp.int32, time: wp.float64):
         """Drive of motor k at a time: linear between the corners of its table, constant outside."""
-        low = model.motor.first_switch[k]
-        high = model.motor.first_switch[k + 1] - 1
-        if time <= model.motor.switch_time[low]:
-            return model.motor.switch_drive[low]
-        if time >= model.motor.switch_time[high]:
-            return model.motor.switch_drive[high]
+        law = model.motor_law[0]
+        low = law.first_switch[k]
+        high = law.first_switch[k + 1] - 1
+        if time <= law.switch_time[low]:
+            return law.switch_drive[low]
+        if time >= law.switch_time[high]:
+            return law.switch_drive[high]
         while high - low > 1:
             middle = (low + high) / 2
-            if model.motor.switch_time[middle] <= time:
+            if law.switch_time[middle] <= time:
                 low = middle
             else:
                 high = middle
-        span = model.motor.switch_time[high] - model.motor.switch_time[low]
-        share = real((time - model.motor.switch_time[low]) / span)
-        return model.motor.switch_drive[low] + share * (model.motor.switch_drive[high] - model.motor.switch_drive[low])
+        span = law.switch_time[high] - law.switch_time[low]
+        share = real((time - law.switch_time[low]) / span)
+        return law.switch_drive[low] + share * (law.switch_drive[high] - law.switch_drive[low])
 
     @wp.func(module=module)
     def sense(model: Model, k: wp.int32, drive: real):
         """Sense in which the drive turns motor k, 1 or -1, and its curve there, scaled by the drive."""
-        curve = model.motor.curve[2 * k]
+        curve = model.motor_law[0].curve[2 * k]
         turns = one
         if drive < zero:
-            curve = model.motor.curve[2 * k + 1]
+            curve = model.motor_law[0].curve[2 * k + 1]
             turns = -one
         strength = wp.abs(drive)
         if curve[0] < zero:
@@ -89,8 +90,8 @@ def curves(p: Precision) -> SimpleNamespace:
             the torque [pN um]; how much it falls with the passive rate [pN um s]; and the slope of the piece of the
             curve that the motor is on [pN um s], -1 for a prescribed rate.
         """
-        if model.motor.prescribed[k] != 0:
-            return (drive * model.motor.rate[k] - passive_rate) / mobility, one / mobility, -one
+        if model.motor_law[0].prescribed[k] != 0:
+            return (drive * model.motor_law[0].rate[k] - passive_rate) / mobility, one / mobility, -one
         turns, curve = sense(model, k, drive)
         own = turns * passive_rate
         knee = curve[1]
@@ -160,10 +161,10 @@ def _functions(p: Precision) -> SimpleNamespace:
                 passive_rate = mobility * state.spin_torque[first] - wp.dot(m, spin)
                 drive = drive_at(model, k, state.time[c])
                 torque, softness, slope = settled(model, k, drive, mobility, passive_rate)
-                if slope != state.motor.slope[k]:
+                if slope != state.motor[0].slope[k]:
                     changed = True
-                state.motor.slope[k] = slope
-                state.motor.torque[k] = torque
+                state.motor[0].slope[k] = slope
+                state.motor[0].torque[k] = torque
                 reaction += torque * m
                 stiffness += softness * wp.outer(m, m)
                 k += 1
@@ -182,7 +183,7 @@ def _functions(p: Precision) -> SimpleNamespace:
         k = begin
         while k < end:
             first = model.first_node[k]
-            torque = state.motor.torque[k]
+            torque = state.motor[0].torque[k]
             state.spin_torque[first] = state.spin_torque[first] + torque
             state.flagellum_torque[k] = state.flagellum_torque[k] - torque * state.pose.tangent[first]
             k += 1
@@ -199,12 +200,12 @@ def _held_functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def on_spin(model: Model, state: State, e: wp.int32, k: wp.int32, torque: real):
         if e == model.first_node[k]:
-            return torque + state.motor.held[k]
+            return torque + state.motor[0].held[k]
         return torque
 
     @wp.func(module=module)
     def on_body(model: Model, state: State, k: wp.int32, force: vec3, torque: vec3):
-        return force, torque - state.motor.held[k] * state.pose.tangent[model.first_node[k]]
+        return force, torque - state.motor[0].held[k] * state.pose.tangent[model.first_node[k]]
 
     return SimpleNamespace(on_spin=on_spin, on_body=on_body)
 

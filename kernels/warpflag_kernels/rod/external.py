@@ -29,13 +29,13 @@ def functions(p: Precision) -> SimpleNamespace:
             carried += half
         if e + 1 < model.first_node[k + 1]:
             carried += half
-        return force + carried * model.external.force_per_length[model.cell_of[e]]
+        return force + carried * model.external[0].force_per_length[model.cell_of[e]]
 
     @wp.func(module=module)
     def on_body(model: Model, state: State, k: wp.int32, force: vec3, torque: vec3):
         c = model.cell_of[model.first_node[k]]
         if k == model.first_flagellum[c]:
-            return force + model.external.body_force[c], torque
+            return force + model.external[0].body_force[c], torque
         return force, torque
 
     return SimpleNamespace(on_node=on_node, on_body=on_body)

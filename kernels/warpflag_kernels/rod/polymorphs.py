@@ -52,18 +52,18 @@ def functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def ground_state(model: Model, state: State, e: wp.int32, k: wp.int32, time: wp.float64):
         """Ground state of joint e at a time [rad]."""
-        own = model.polymorphs.rest_strain[3 * e + state.forms.form[e]]
-        share = (time - state.forms.changed[e]) / model.polymorphs.ramp[k]
+        own = model.polymorphs[0].rest_strain[3 * e + state.forms[0].form[e]]
+        share = (time - state.forms[0].changed[e]) / model.polymorphs[0].ramp[k]
         if share < wp.float64(1.0):
             s = p.real(wp.max(share, wp.float64(0.0)))
             s = s * s * (p.real(3.0) - p.real(2.0) * s)
-            own = (p.real(1.0) - s) * model.polymorphs.rest_strain[3 * e + state.forms.before[e]] + s * own
+            own = (p.real(1.0) - s) * model.polymorphs[0].rest_strain[3 * e + state.forms[0].before[e]] + s * own
         return own
 
     @wp.func(module=module)
     def ramped(model: Model, state: State, e: wp.int32, k: wp.int32, c: wp.int32):
         """Sets the ground state of joint e to that at the time of the evaluation."""
-        state.forms.rest_strain[e] = ground_state(model, state, e, k, state.time[c])
+        state.forms[0].rest_strain[e] = ground_state(model, state, e, k, state.time[c])
 
     @wp.func(module=module)
     def in_flagellum(model: Model, state: State, k: wp.int32, c: wp.int32):
@@ -102,17 +102,17 @@ def _kernels(p: Precision) -> SimpleNamespace:
         w = joint_strain(
             chart.base.tangent[e], chart.base.tangent[e + 1], chart.base.director[e], chart.base.director[e + 1]
         )
-        return w - state.forms.rest_strain[e]
+        return w - state.forms[0].rest_strain[e]
 
     @wp.func(module=module)
     def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32):
         """Moment of joint e along its ground state, against the handedness of form 0 [pN um]."""
-        rest = model.polymorphs.rest_strain[3 * e + state.forms.form[e]]
+        rest = model.polymorphs[0].rest_strain[3 * e + state.forms[0].form[e]]
         d = strain_change(model, state, chart, e)
         a = model.rod.bending_rigidity[k]
         moment = vec3(a * d[0], a * d[1], model.rod.twist_rigidity[k] * d[2])
         m = -wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k])
-        if rest[2] * model.polymorphs.rest_strain[3 * e][2] < real(0.0):
+        if rest[2] * model.polymorphs[0].rest_strain[3 * e][2] < real(0.0):
             m = -m
         return wp.float64(m)
 
@@ -122,7 +122,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
         The axis is the mean tangent over a turn around e, at the ends over the first or the last one.
         """
-        rest = model.polymorphs.rest_strain[3 * e]
+        rest = model.polymorphs[0].rest_strain[3 * e]
         half = wp.int32(half_turn / wp.length(rest))
         moment = vec3(real(0.0))
         along = vec3(real(0.0))
@@ -172,16 +172,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
         now = control.time[c]
         if counted == 0:
             now = advanced(control, c)
-        rest = now - model.polymorphs.ramp[k]  # what changed after this is on its ramp
+        rest = now - model.polymorphs[0].ramp[k]  # what changed after this is on its ramp
         root = first + 1
         tip = model.first_node[k + 1] - 2
         reach = 1 + wp.int32(real(end_length) / model.rod.segment_length[k])
-        nucleation = model.polymorphs.nucleation[k]
-        propagation = model.polymorphs.propagation[k]
+        nucleation = model.polymorphs[0].nucleation[k]
+        propagation = model.polymorphs[0].propagation[k]
         goes_on = bool(False)
-        i = model.polymorphs.first_second[k]
-        while i < model.polymorphs.first_second[k + 1]:
-            if now >= model.polymorphs.second[i][0] and now < model.polymorphs.second[i][1]:
+        i = model.polymorphs[0].first_second[k]
+        while i < model.polymorphs[0].first_second[k + 1]:
+            if now >= model.polymorphs[0].second[i][0] and now < model.polymorphs[0].second[i][1]:
                 goes_on = True
             i += 1
         # The joint before this one as it was when the step ended: `before` is 0 in form 0, 1 in another form, 2 on its
@@ -190,17 +190,17 @@ def _kernels(p: Precision) -> SimpleNamespace:
         form_before = int(2)
         e = root
         while e <= tip:
-            form = state.forms.form[e]
+            form = state.forms[0].form[e]
             left = wp.min(form, 1)
             own = int(left)
             own_form = int(form)
-            if state.forms.changed[e] > rest:
+            if state.forms[0].changed[e] > rest:
                 own = 2
                 own_form = 0
             else:
                 after = int(2)
-                if e < tip and state.forms.changed[e + 1] <= rest:
-                    after = wp.min(state.forms.form[e + 1], 1)
+                if e < tip and state.forms[0].changed[e + 1] <= rest:
+                    after = wp.min(state.forms[0].form[e + 1], 1)
                 ends = e - root < reach or tip - e < reach
                 led = before == 1 - left or after == 1 - left
                 over = bool(False)
@@ -213,12 +213,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
                     else:
                         over = axial_moment(model, state, chart, e, k, root, tip) < nucleation[1]
                 if over:
-                    state.forms.form[e] = 1 - left
+                    state.forms[0].form[e] = 1 - left
                 elif form == 1 and goes_on and form_before == 2:
-                    state.forms.form[e] = 2
-                if state.forms.form[e] != form:
-                    state.forms.before[e] = form
-                    state.forms.changed[e] = now
+                    state.forms[0].form[e] = 2
+                if state.forms[0].form[e] != form:
+                    state.forms[0].before[e] = form
+                    state.forms[0].changed[e] = now
             before = own
             form_before = own_form
             e += 1

@@ -75,15 +75,21 @@ def functions(independent: bool) -> SimpleNamespace:
     """
     name = "independent" if independent else "systematic"
     module = wp.get_module(f"warpflag_kernels.accuracy_{name}")
-    exponent = 0.5 if independent else 1.0
-    scale, power = wp.constant(wp.float64(SPAN ** (1.0 - exponent))), wp.constant(wp.float64(exponent))
-    root, alike = wp.constant(wp.float64(1.0 / (3.0 - exponent))), wp.constant(wp.float64((SPAN / CORRELATION) ** 0.5))
+    scale, root = (wp.constant(wp.float64(x)) for x in ((SPAN**0.5, 1.0 / 2.5) if independent else (1.0, 0.5)))
+    alike = wp.constant(wp.float64((SPAN / CORRELATION) ** 0.5))
     span, window, begin = (wp.constant(wp.float64(x)) for x in (SPAN, WINDOW, BEGIN))
+
+    @wp.func(module=module)
+    def rooted(x: wp.float64):
+        """x to the power p."""
+        if wp.static(independent):
+            x = wp.sqrt(x)
+        return x
 
     @wp.func(module=module)
     def may_make(rate: wp.float64, dt: wp.float64):
         """Error that a step may make where `rate` [um/s] is asked for [um]."""
-        most = rate * scale * wp.pow(dt, power)
+        most = rate * scale * rooted(dt)
         if wp.static(independent):
             most = wp.min(most, rate * alike * dt)
         return most
@@ -91,10 +97,9 @@ def functions(independent: bool) -> SimpleNamespace:
     @wp.func(module=module)
     def longest(rate: wp.float64, level: wp.float64):
         """Step whose error, level dt^3 [um], is what it may make at this rate [s]."""
-        dt = wp.pow(rate * scale / level, root)
-        if wp.static(independent):
-            dt = wp.min(dt, wp.sqrt(rate * alike / level))
-        return dt
+        if wp.static(not independent):
+            return wp.sqrt(rate / level)
+        return wp.min(wp.pow(rate * scale / level, root), wp.sqrt(rate * alike / level))
 
     @wp.func(module=module)
     def add(a: Achieved, c: wp.int32, dt: wp.float64, error: wp.float64, time: wp.float64, shortest: wp.float64):
@@ -116,7 +121,7 @@ def functions(independent: bool) -> SimpleNamespace:
         a.window[c] += sum
         a.window_time[c] += dt
         if a.window_time[c] >= window:
-            found = wp.pow(a.window[c] / a.window_time[c], power)
+            found = rooted(a.window[c] / a.window_time[c])
             if found > a.worst[c]:
                 a.worst[c] = found
                 a.worst_end[c] = time
@@ -124,7 +129,7 @@ def functions(independent: bool) -> SimpleNamespace:
             a.window_time[c] = zero
         a.span[c] += sum
         a.span_time[c] += dt
-        beyond = a.limit[c] > zero and wp.pow(a.span[c] / span, power) > a.limit[c]
+        beyond = a.limit[c] > zero and rooted(a.span[c] / span) > a.limit[c]
         if a.span_time[c] >= span:
             a.span[c] = zero
             a.span_time[c] = zero

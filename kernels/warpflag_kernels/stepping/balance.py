@@ -60,6 +60,9 @@ def struct(p: Precision) -> Any:
         work: wp.array(dtype=wp.float64)  # [K], of the terms that store no energy [pN um]
         energy: wp.array(dtype=wp.float64)  # [K], after the step [pN um]
         stored: wp.array(dtype=wp.float64)  # [C], before it [pN um]
+        stored_after: wp.array(dtype=wp.float64)  # [C], that after it, of all flagella [pN um]
+        all_off: wp.array(dtype=wp.float64)  # [C], energy if every strain were 1 off its rest value [pN um]
+        kept: wp.array(dtype=wp.int32)  # [C], 1: the step keeps the balance
         # Where ground states change, what that adds to the energy in the step.
         ramped: wp.array(dtype=wp.float64)  # [K] [pN um]
         ramped_within: wp.array(dtype=wp.float64)  # [K], to within this [pN um]
@@ -90,10 +93,22 @@ def allocate(model: DeviceModel) -> Any:
     if ramps(model):
         for name in ("ramped", "ramped_within"):
             setattr(b, name, wp.zeros(model.flagellum_count, dtype=wp.float64, device=device))
-    b.stored = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
-    for name in ("known", "refused", "lasting"):
+    b.stored, b.stored_after = (wp.zeros(model.cell_count, dtype=wp.float64, device=device) for _ in range(2))
+    b.all_off = wp.array(_energy_off(model), dtype=wp.float64, device=device)
+    for name in ("known", "kept", "refused", "lasting"):
         setattr(b, name, wp.zeros(model.cell_count, dtype=wp.int32, device=device))
     return b
+
+
+def _energy_off(model: DeviceModel) -> np.ndarray:
+    """Energy of a cell if every strain were 1 off its rest value [pN um], shape [C]."""
+    rod, first_node = model.data.rod, model.data.first_node.numpy()
+    h, bend, twist, stretch = (
+        x.numpy().astype(float)
+        for x in (rod.segment_length, rod.bending_rigidity, rod.twist_rigidity, rod.stretching_stiffness)
+    )
+    segment = 0.5 * (stretch * h + (bend + twist) / h)
+    return np.add.reduceat((np.diff(first_node) - 1) * segment, model.data.first_flagellum.numpy()[:-1])
 
 
 @functools.cache
@@ -191,42 +206,40 @@ def _kernels(p: Precision, storing: tuple[Term, ...]) -> SimpleNamespace:
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions `kept`, whether a step keeps the balance, and `count`, of steps that do not."""
-    Model, Balance = structs(p).Model, struct(p)
+    """Device functions `judge`, whether a step keeps the balance, and `count`, of steps that do not."""
+    Balance = struct(p)
     module = p.module("balance_functions")
     most = wp.constant(wp.float64(MOST_DISSIPATED))
     round_off = wp.constant(wp.float64(ROUND_OFF * 2.0 * np.finfo(p.name).eps))
     weight, lasting = wp.constant(wp.int32(WEIGHT)), wp.constant(wp.int32(LASTING))
 
     @wp.func(module=module)
-    def kept(model: Model, balance: Balance, c: wp.int32, dt: wp.float64, error: wp.float64):
-        """Whether a step of dt, which may err by `error` [um], keeps the balance; and the energy after it [pN um]."""
+    def judge(
+        first_flagellum: wp.array(dtype=wp.int32), balance: Balance, c: wp.int32, dt: wp.float64, error: wp.float64
+    ):
+        """Whether a step of dt, which may err by `error` [um], keeps the balance; and the energy after it."""
         zero = wp.float64(0.0)
         work = zero
         energy = zero
         power = zero
         load = zero
-        all_off = zero
         stored = balance.stored[c]
         ramped_within = zero
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
+        k = first_flagellum[c]
+        while k < first_flagellum[c + 1]:
             work += balance.work[k]
             energy += balance.energy[k]
             power += balance.power[k]
             load += balance.load[k]
-            h = wp.float64(model.rod.segment_length[k])
-            bend = wp.float64(model.rod.bending_rigidity[k]) + wp.float64(model.rod.twist_rigidity[k])
-            each = wp.float64(0.5) * (wp.float64(model.rod.stretching_stiffness[k]) * h + bend / h)
-            all_off += wp.float64(model.first_node[k + 1] - model.first_node[k] - 1) * each
             if balance.ramped.shape[0] > 0:
                 stored += balance.ramped[k]
                 ramped_within += balance.ramped_within[k]
             k += 1
-        within = ramped_within + load * error + round_off * wp.sqrt(wp.max(energy, stored) * all_off)
+        within = ramped_within + load * error + round_off * wp.sqrt(wp.max(energy, stored) * balance.all_off[c])
         dissipated = work - (energy - stored)
         good = dissipated > -within and dissipated < most * power * dt + within
-        return good or balance.known[c] == 0, energy
+        balance.kept[c] = wp.where(good or balance.known[c] == 0, 1, 0)
+        balance.stored_after[c] = energy
 
     @wp.func(module=module)
     def count(balance: Balance, c: wp.int32, good: wp.bool):
@@ -238,7 +251,7 @@ def functions(p: Precision) -> SimpleNamespace:
         balance.lasting[c] += weight
         return balance.lasting[c] > lasting
 
-    return SimpleNamespace(kept=kept, count=count)
+    return SimpleNamespace(judge=judge, count=count)
 
 
 def storing(model: DeviceModel) -> tuple[Term, ...]:
@@ -310,7 +323,7 @@ def _ramp_kernel(p: Precision) -> Any:
                 total -= wp.float64(wp.dot(scaled, before - at_start + after - at_end))
                 d = wp.cw_mul(scaled, after - before - change)
                 within += wp.float64(wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2]))
-                evaluated = state.forms.rest_strain[e]
+                evaluated = state.forms[0].rest_strain[e]
                 later = wp.cw_mul(stiffness, evaluated - at_end)
                 stored += wp.float64(wp.dot(later, after - half * (evaluated + at_end)))
             e += 1

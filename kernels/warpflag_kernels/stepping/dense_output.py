@@ -93,7 +93,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         dense.director[i] = state.pose.director[e]
         dense.energy[i] = energy[e]
         if dense.form.shape[0] > 0:
-            dense.form[i] = state.forms.form[e]
+            dense.form[i] = state.forms[0].form[e]
         if dense.steric.shape[0] > 0:
             dense.steric[i] = steric[e]
         k = model.flagellum_of[e]
@@ -102,7 +102,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             turned = motor_turn(model, dense.start, state.pose, e, k, c)
             dense.motor_angle[slot * flagella + k] = dense.start_motor_angle[k] + turned
             if dense.motor_torque.shape[0] > 0:
-                dense.motor_torque[slot * flagella + k] = state.motor.torque[k]
+                dense.motor_torque[slot * flagella + k] = state.motor[0].torque[k]
             if k == model.first_flagellum[c]:
                 i = slot * (model.first_flagellum.shape[0] - 1) + c
                 dense.step[i] = dense.steps[c]

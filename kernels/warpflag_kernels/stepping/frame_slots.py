@@ -121,5 +121,5 @@ def allocate(model: DeviceModel, state: DeviceState) -> DenseOutput:
             setattr(own, name, getattr(state.data, name))
     allocate_pose(p, cells, elements, device, own.pose)
     own.active = d.due
-    measured = DeviceState(own, state.pairs, state.shell, neighbours.allocate(model))
+    measured = DeviceState(own, state.optional, state.pairs, state.shell, neighbours.allocate(model))
     return DenseOutput(d, measured, zeros(elements, p.vec3), zeros(elements, p.real))

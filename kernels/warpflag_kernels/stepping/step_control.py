@@ -110,11 +110,6 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
         return may_make(control.error_rate[c], dt)
 
     @wp.func(module=module)
-    def asked(control: StepControl, c: wp.int32, dt: wp.float64):
-        """Error that a step may make by the accuracy, which fixed steps need not keep [um]."""
-        return may_make(control.achieved.asked[c], dt)
-
-    @wp.func(module=module)
     def accept(
         control: StepControl,
         c: wp.int32,
@@ -198,4 +193,4 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
             dt = wp.float64(0.5) * left
         return dt
 
-    return SimpleNamespace(allowed=allowed, asked=asked, accept=accept, next_step=next_step, smallest=smallest)
+    return SimpleNamespace(allowed=allowed, accept=accept, next_step=next_step, smallest=smallest)

@@ -302,7 +302,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
             state.pose.body_axis[c] = body_axis(orientation)
         spin = x.node[e][3]
         carried = transport(chart.base.director[e], chart.base.tangent[e], t)
-        if wp.static(lawful) and e == first and model.motor.prescribed[k] != 0:
+        if wp.static(lawful) and e == first and model.motor_law[0].prescribed[k] != 0:
             # The tripod keeps to its rate against the body as it has turned in the end.
             turned = orientation * wp.quat_inverse(chart.base.body_orientation[c])
             carried = vec3(wp.quat_rotate(turned, wp.vec3d(chart.base.director[e])))
