@@ -82,7 +82,7 @@ def test_mobility_is_the_one_of_the_model():
 def test_table_of_a_run(tmp_path):
     made = Zipping(tmp_path)
     (tmp_path / "summary.json").write_text('{"status": "stopped", "time": 0.0081}')
-    row = dict(zip(table.COLUMNS, table._row(tmp_path), strict=True))
+    row = dict(zip(table.COLUMNS, table.row(tmp_path), strict=True))
     assert row["run"] == f"{tmp_path.name} (stopped at 8.10 ms)"
     assert row["zip, held"] == "7.00"  # the front reaches the last node when 0.4 + 0.1 (t - 1 ms) = 1
     assert (row["motor"], row["body"], row["speed"]) == ("366", f"{made.body_rate:.1f}", f"{made.body_speed:.0f}")

@@ -262,3 +262,28 @@ def test_a_script_for_the_type_checker_uses_every_public_name():
 
     used = (ROOT / "tests" / "scene" / "public_names.py").read_text(encoding="utf-8")
     assert [name for name in warpflag.__all__ if f" {name}" not in used and f"warpflag.{name}" not in used] == []
+
+
+def private_names(code: str) -> list[str]:
+    """Names that begin with an underscore which code reads or patches in something other than its own objects."""
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        names: list[str] = []
+        if isinstance(node, ast.Attribute) and not (isinstance(node.value, ast.Name) and node.value.id == "self"):
+            names = [node.attr]
+        elif isinstance(node, ast.ImportFrom):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and "attr" in node.func.attr:
+            patched = [part.value for part in node.args[:2] if isinstance(part, ast.Constant)]
+            names = [part.rpartition(".")[2] for part in patched if isinstance(part, str)]
+        found += [name for name in names if re.fullmatch(r"_(?!_|repr_\w+_$|replace$).*", name)]
+    return sorted(found)
+
+
+def test_tests_reach_for_public_names_alone():
+    """They use options, plans and inputs made for the case; `_repr_html_` of notebooks and `_replace` are public."""
+    patched = "a._b = c.d\nfrom e import _f\ng.setattr(h, '_i', j)\ng.setattr('k._l', m)\nself._n = a._repr_html_()\n"
+    assert private_names(patched) == ["_b", "_f", "_i", "_l"]
+    tests = [path for path in PYTHON if ROOT / "tests" in path.parents]
+    found = {str(path.relative_to(ROOT)): private_names(path.read_text(encoding="utf-8")) for path in tests}
+    assert {path: names for path, names in found.items() if names} == {}

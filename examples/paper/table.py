@@ -39,12 +39,12 @@ def markdown(runs: Path, groups: dict[str, list[str]]) -> str:
     """The tables of all groups of runs, and of the fitted zipper."""
     lines = ["# Measured", "", NOTES]
     for title, names in groups.items():
-        lines += [f"## {title}", "", *_table([COLUMNS, UNITS], [_row(runs / name) for name in names]), ""]
+        lines += [f"## {title}", "", *_table([COLUMNS, UNITS], [row(runs / name) for name in names]), ""]
     lines += [*_main_run(runs / "L8-phi90"), *_checks(runs)]
     return "\n".join([*lines, *_zipper(runs, next(iter(groups.values())))]) + "\n"
 
 
-def _row(directory: Path) -> list[str]:
+def row(directory: Path) -> list[str]:
     with Record(directory) as record:
         measured, times = record.observables, 1e3 * record.times
         theta, lengths, force = (

@@ -72,7 +72,7 @@ class Attack:
             "damage": lambda: runs.damage(self.base, seed, scratch),
             "malformed": lambda: scenes.malformed_scene(seed, scratch),
             "random": lambda: scenes.random_scene(seed, scratch),
-            "extremes": lambda: extremes.extreme(_scattered(number, COUNTS["extremes"]), scratch),
+            "extremes": lambda: extremes.extreme(scattered(number, COUNTS["extremes"]), scratch),
         }
         begin = time.monotonic()
         try:
@@ -89,7 +89,7 @@ class Attack:
         return one
 
 
-def _scattered(number: int, count: int) -> int:
+def scattered(number: int, count: int) -> int:
     """A permutation of 0 to count - 1, so that the first attempts are spread over all rows and forms."""
     stride = next(s for s in range(int(count * 0.618), count) if _coprime(s, count))
     return number * stride % count

@@ -62,7 +62,7 @@ def test_how_a_command_ends_is_judged(status, said, words):
 
 def test_every_row_and_form_of_the_extremes_is_tried_once():
     count = extremes.COUNT
-    assert sorted(attack._scattered(k, count) for k in range(count)) == list(range(count))
+    assert sorted(attack.scattered(k, count) for k in range(count)) == list(range(count))
     assert len(extremes.ROWS) >= 40 and len(extremes.FORMS) == 16
     left = list(attack.in_turn({"kills": 2, "random": 4}, {("random", 1)}))
     assert left == [("kills", 0), ("random", 0), ("kills", 1), ("random", 2), ("random", 3)]

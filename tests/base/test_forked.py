@@ -73,7 +73,7 @@ def test_processes_share_what_was_prepared_once_and_end_by_themselves(starter):
 def test_a_process_outlives_its_starter_and_the_starter_no_signal_but_its_end(starter):
     process = starter.fork()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        os.kill(starter._process.pid, number)
+        os.kill(starter.process.pid, number)
     other = starter.fork()  # it still starts processes
     process.send_signal(signal.SIGTERM)  # which take signals again
     assert process.wait() == -signal.SIGTERM
@@ -92,9 +92,9 @@ def test_a_starter_that_ended_is_an_error_of_the_machine(starter):
 
 def test_a_starter_ends_with_the_process_that_made_it(starter):
     starter.fork()
-    starter._socket.close()
+    starter.connection.close()
     for _ in range(100):
-        if starter._process.poll() is not None:
+        if starter.process.poll() is not None:
             break
         time.sleep(0.05)
-    assert starter._process.poll() == 0
+    assert starter.process.poll() == 0

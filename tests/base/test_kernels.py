@@ -13,7 +13,6 @@ import pytest
 import warp as wp
 
 from tests.helpers import cell
-from warpflag.base import kernels
 from warpflag.base.device import find_device
 from warpflag.base.kernel_cache import keep_checksums, remove_damaged
 from warpflag.base.kernels import load_kernels, noted_launches
@@ -66,25 +65,23 @@ def test_noted_launches_are_not_made():
 @pytest.mark.parametrize("stream", [Screen, io.StringIO])
 def test_what_is_compiled_is_said_once(stream, tmp_path, monkeypatch):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(kernels, "_SECONDS_BEFORE_EXPLAINING", 0.0)
     monkeypatch.setenv("COLUMNS", "60")
     said = stream()
     monkeypatch.setattr("sys.stderr", said)
     _, values, launch = two_kernels()
-    load_kernels(launch, find_device("cpu"))
+    load_kernels(launch, find_device("cpu"), patience=0.0)
     assert len(list(tmp_path.iterdir())) == 2 and not values.numpy().any()
     lines = [line.rpartition("\r")[2] for line in said.getvalue().removesuffix("\n").split("\n")]
     assert lines[0].startswith("warpflag: compiling 2 modules of kernels, once") and str(tmp_path) in lines[0]
     shown = [line for line in lines[1:] if line.startswith("compiling kernels, 2 of 2")]
     assert len(shown) == (stream is Screen) and len(lines) == 1 + len(shown)
-    load_kernels(launch, find_device("cpu"))  # from the cache
+    load_kernels(launch, find_device("cpu"), patience=0.0)  # from the cache
     assert said.getvalue().count("modules of kernels") == 1
 
 
 def test_quiet_says_nothing(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(kernels, "_SECONDS_BEFORE_EXPLAINING", 0.0)
-    load_kernels(two_kernels()[2], find_device("cpu"), quiet=True)
+    load_kernels(two_kernels()[2], find_device("cpu"), quiet=True, patience=0.0)
     assert len(list(tmp_path.iterdir())) == 2 and capfd.readouterr() == ("", "")
 
 
@@ -170,7 +167,7 @@ def test_a_run_launches_no_kernel_that_was_not_loaded_before(values, monkeypatch
     loaded, late, launch = set(), set(), wp.launch
     simulation = Simulation(cell({"duration": 2e-5, "frames": 3, **values}), device="cpu", capture=False)
     with monkeypatch.context() as patch:
-        patch.setattr(kernels, "_load", lambda module, _block, _device: loaded.add(module))
+        patch.setattr(wp, "force_load", lambda _device, modules, *_: loaded.update(modules))
         simulation.prepare(recording=True)
 
     def spied(kernel, *arguments, **options):

@@ -211,8 +211,8 @@ def test_torques_of_a_step_are_those_of_the_dense_equations(precision, device):
     random, size = np.random.default_rng(3), 6 + 4 * b.count
     last, found, x = (2e-3 * random.uniform(-1, 1, size) for _ in range(3))
     last, found, given = (b.increment(y[:6], y[6:].reshape(-1, 4)) for y in (last, found, x))
-    motor_solve.prepare(b.model, b.state, band, s._motors)
-    motor_solve.solve(b.model, b.state, s.data, band, s.law.gain, s._motors, last, found, s.data.one, given)
+    motor_solve.prepare(b.model, b.state, band, s.motors)
+    motor_solve.solve(b.model, b.state, s.data, band, s.law.gain, s.motors, last, found, s.data.one, given)
     torques, solution = b.state.optional.motor.held.numpy().astype(float), flat(given)
     # What a torque T_k adds: P of the load on its tripod and on the body.
     system, mobility = dense_system(exact, step, weight), exact.mobility("none")

@@ -18,7 +18,6 @@ import pytest
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.base.output import DiskError
 from warpflag.record import Record, RecordError, new_record
-from warpflag.record import recorder as recorder_module
 from warpflag.record.layout import E1, POSITION
 from warpflag.record.recorder import Recorder
 
@@ -207,14 +206,14 @@ def contents(path: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("count", [1, 3, 64, 65, 150])
-def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written(tmp_path, count, monkeypatch):
+def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written(tmp_path, count):
     """Records of a batch begin with the bytes of the first of them, with their own numbers in place."""
-    monkeypatch.setattr(new_record, "_templates", {})
+    before = set(new_record.TEMPLATES)
     for k in range(3):
         at_once, each = (
-            started(tmp_path / f"{name}-{k}.h5", block_frames=count, keep_open=False) for name in ("at once", "each")
+            started(tmp_path / f"{name}-{k}.h5", block_frames=frames, keep_open=False)
+            for name, frames in (("at once", count), ("each", 1))
         )
-        each._block_frames = 1
         for recorder in (at_once, each):
             scene, size = f'name = "{k}"  # of a length of its own{"!" * (k // 2)}\n', 1.0 + k
             options = {"filament_radius": size, "body_length": 2 * size, "body_width": 0.5, "versions": {"h5py": "3"}}
@@ -231,7 +230,9 @@ def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written
         more.close()
         with Record(at_once.path) as record:
             assert_holds_frames(record, range(7 * k, 7 * k + count + 1))
-    assert len(new_record._templates) == (2 if count == 1 else 4)  # two lengths of the text, all frames and one
+    assert len(new_record.TEMPLATES.keys() - before) == (
+        2 if count == 1 else 4
+    )  # two lengths of the text, all frames and one
 
 
 def test_a_short_record_that_is_committed_piece_by_piece_is_whole_each_time(tmp_path):
@@ -259,7 +260,7 @@ def test_a_short_record_that_is_committed_piece_by_piece_is_whole_each_time(tmp_
     short.close()
 
 
-def test_what_is_small_is_kept_until_a_record_is_long_or_continued(tmp_path, monkeypatch):
+def test_what_is_small_is_kept_until_a_record_is_long_or_continued(tmp_path):
     recorder = started(tmp_path / "run.h5", block_frames=3)
     for index in range(7):
         recorder.write(frame(index))
@@ -273,8 +274,7 @@ def test_what_is_small_is_kept_until_a_record_is_long_or_continued(tmp_path, mon
     continued.write(frame(4))
     continued.close()
     assert continued.kept() is None
-    monkeypatch.setattr(recorder_module, "_MOST_KEPT", 5)
-    long = started(tmp_path / "long.h5")
+    long = started(tmp_path / "long.h5", most_kept=5)
     for index in range(7):
         long.write(frame(index))
     long.close()

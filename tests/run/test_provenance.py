@@ -16,10 +16,10 @@ import warpflag
 from tests.runs import arrays, assert_same_frames, ended_at, executed, small, summary
 from warpflag import cli
 from warpflag.record import Record, RecordError
-from warpflag.run import checkpoint, run, run_directory
+from warpflag.run import checkpoint, run
 from warpflag.run.checkpoint import CheckpointError
 from warpflag.run.lock import Lock, LockedError
-from warpflag.run.run_directory import RunError
+from warpflag.run.run_directory import RunError, settings_sha256
 from warpflag.scene import Scene, dumps, load, with_values
 
 
@@ -111,13 +111,15 @@ def test_the_checkpoint_of_another_run_is_refused(tmp_path):
         run.resume(str(directory))
 
 
-def test_a_setting_that_a_later_version_adds_leaves_runs_resumable(tmp_path, monkeypatch):
-    directory = halved(tmp_path / "made")
-    run_directory._default_settings.cache_clear()
-    monkeypatch.setattr(run_directory, "dumps", lambda scene: dumps(scene).replace("[steric]", "[steric]\nadded = 0.0"))
-    assert run.resume(str(directory)).execute(quiet=True).status == "done"
-    run_directory._default_settings.cache_clear()
-    assert_same_frames(executed(small(), tmp_path / "whole"), directory)
+def test_a_setting_that_a_later_version_adds_leaves_runs_resumable():
+    """Checkpoints are known by the hash of the settings, in which what is as by default does not count."""
+    scene, default = small({"motor.torque": 1.0}), Scene(name="default")
+    later, later_default, set_later = (
+        dumps(own).replace("[steric]", f"[steric]\nadded = {value}")
+        for own, value in ((scene, 0.0), (default, 0.0), (scene, 1.0))
+    )
+    assert settings_sha256(scene, later, later_default) == settings_sha256(scene)
+    assert settings_sha256(scene, set_later, later_default) != settings_sha256(scene)
 
 
 def test_the_record_of_another_run_is_refused(tmp_path):

@@ -147,11 +147,15 @@ def test_a_member_whose_files_are_damaged_is_reported_and_the_rest_done(tmp_path
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device that plays a full disk")
-@pytest.mark.parametrize("alone", [False, True])
-def test_a_member_whose_disk_is_full_is_told_in_one_line_and_the_rest_done(tmp_path, capsys, monkeypatch, alone):
-    if alone:
-        monkeypatch.setattr(SweepRun, "_batch_size", lambda *_: 1)
-    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+@pytest.mark.parametrize(
+    "axis",
+    [
+        {"motor.torque": TORQUES},  # one batch
+        {"hydrodynamics.mode": ("none", "within", "between")},  # each alone
+    ],
+)
+def test_a_member_whose_disk_is_full_is_told_in_one_line_and_the_rest_done(tmp_path, capsys, axis):
+    started = sweep.start(Sweep(small(BASE), axis), str(tmp_path / "out"))
     full = tmp_path / "out" / "0001" / "run.h5.tmp"
     full.parent.mkdir()
     full.symlink_to("/dev/full")

@@ -56,7 +56,7 @@ def drawn(draw: Draw, number: int, cells: int) -> tuple[np.ndarray, np.ndarray, 
 
     body_noise.carry, body_noise.add_divergence = carry, lambda *_: None
     try:
-        stepper._draw_flows(in_single=False)
+        stepper.draw_flows(in_single=False)
     finally:
         body_noise.carry, body_noise.add_divergence = real_carry, real_divergence
     by_pairs, by_body = added[0] - before, added[1] - added[0]
@@ -104,7 +104,7 @@ def test_velocities_have_the_covariance_of_the_whole_mobility(device):
     found = []
     for number in range(draws):
         draw.local(number)
-        draw.stepper._draw_flows(in_single=False)
+        draw.stepper.draw_flows(in_single=False)
         nodes = draw.stepper.noise.node.numpy()[draw.moving, :3].reshape(count, -1)
         found.append(np.hstack([draw.stepper.noise.body.numpy(), nodes]))
     found = np.concatenate(found)

@@ -64,7 +64,7 @@ def test_forces_belong_to_the_thermal_velocities(name, precision, device):
     draw = Draw([scene], [start], device)
     stepper, drift = draw.stepper, draw.stepper.drift
     draw.local(2)
-    stepper._draw_flows(in_single=False)
+    stepper.draw_flows(in_single=False)
     lanczos = stepper.lanczos.data if stepper.lanczos else mean_drift.lanczos_stage.struct(draw.model.precision)()
     mean_drift.remember(draw.model, draw.state, draw.control, stepper.noise, lanczos, None, drift)
     g = np.concatenate([drift.on_body.numpy()[0], drift.force.numpy()[draw.moving].ravel()]).astype(np.float64)
@@ -110,7 +110,7 @@ def test_g_of_a_free_filament(device):
     draw = Draw([scene], [shaken(scene, 3, node=0.002)], device)
     stepper, drift = draw.stepper, draw.stepper.drift
     draw.local(0)
-    stepper._draw_flows(in_single=False)
+    stepper.draw_flows(in_single=False)
     lanczos = stepper.lanczos.data
     mean_drift.remember(draw.model, draw.state, draw.control, stepper.noise, lanczos, None, drift)
     state = draw.state.data

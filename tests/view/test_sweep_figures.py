@@ -77,11 +77,11 @@ def test_points_that_are_not_what_they_say_are_hollow(tmp_path):
         assert full.get_xdata().tolist() == [1.0] and hollow.get_xdata().tolist() == [2.0, 3.0]
         assert hollow.get_markerfacecolor() == "white"
     assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
-    assert "not bundled" in figure._supxlabel.get_text() and "every repeat" in figure._supxlabel.get_text()
+    assert "not bundled" in figure.get_supxlabel() and "every repeat" in figure.get_supxlabel()
 
 
 def test_nothing_is_hollow_where_no_member_zips(grid):
-    assert sweep_figures.curves(sweep_figures.read(grid), numbers=["net_speed"])._supxlabel is None
+    assert sweep_figures.curves(sweep_figures.read(grid), numbers=["net_speed"]).get_supxlabel() == ""
 
 
 def test_a_map_has_its_axes_in_order(grid):

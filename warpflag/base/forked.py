@@ -38,6 +38,10 @@ class Starter:
 
     Args:
         module: name of the module. Its `prepare`, of what `prepare` below is given, loads what all processes need.
+
+    Attributes:
+        process: that forks.
+        connection: the socket on which it is asked; it ends when that is closed.
     """
 
     def __init__(self, module: str) -> None:
@@ -45,7 +49,7 @@ class Starter:
         command = [sys.executable, "-m", "warpflag.base.forked", module]
         hidden = {"CUDA_VISIBLE_DEVICES": ""}
         path = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             command,
             stdin=other.fileno(),
             stdout=2,
@@ -53,7 +57,7 @@ class Starter:
             start_new_session=True,
         )
         other.close()
-        self._socket, self._lock = own, threading.Lock()
+        self.connection, self._lock = own, threading.Lock()
 
     @staticmethod
     def works() -> bool:
@@ -95,17 +99,17 @@ class Starter:
 
     def close(self) -> None:
         """Ends the process; those that it has started go on."""
-        self._socket.close()
+        self.connection.close()
         with contextlib.suppress(OSError):
-            self._process.kill()
-        self._process.wait()
+            self.process.kill()
+        self.process.wait()
 
     def _ask(self, request: dict[str, Any], files: tuple[int, ...] = ()) -> Any:
         content = json.dumps(request).encode()
         with self._lock:
-            socket.send_fds(self._socket, [f"{len(content):{_DIGITS}d}".encode()], files)
-            self._socket.sendall(content)
-            answer = self._socket.recv(_LONGEST)
+            socket.send_fds(self.connection, [f"{len(content):{_DIGITS}d}".encode()], files)
+            self.connection.sendall(content)
+            answer = self.connection.recv(_LONGEST)
         if not answer:
             raise ConnectionError("the process that starts workers has ended")
         return json.loads(answer)

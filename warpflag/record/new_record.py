@@ -25,7 +25,7 @@ from warpflag.record.layout import (
 )
 from warpflag.record.rows import Rows
 
-__all__ = ["FORMAT", "add_parameters", "first_image", "growth", "values_of"]
+__all__ = ["FORMAT", "TEMPLATES", "add_parameters", "first_image", "growth", "values_of"]
 
 FORMAT = ("v108", "v108")
 """The format of HDF5 1.8, in which groups and headers of datasets have checksums. Later formats mark a file as open
@@ -37,7 +37,8 @@ _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
 _TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
 _TEMPLATE_BYTES = 1 << 26  # of all templates that are kept: those of a batch, whose texts differ by some letters
-_templates: dict[Any, _Template] = {}
+TEMPLATES: dict[Any, _Template] = {}
+"""Records that new ones of this process begin with, by what such records have in common."""
 
 
 def values_of(frame: Frame) -> dict[str, Any]:
@@ -75,12 +76,12 @@ def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any])
     shapes = tuple((name, values.shape) for name, values in rows.items())
     kept = tuple((name, _stored(value).shape, _stored(value).dtype.str) for name, value in _plain(parameters).items())
     key = (shapes, kept, tuple(parameters["versions"].items()))
-    template = _templates.get(key)
+    template = TEMPLATES.get(key)
     if template is None:
         template = _Template.made(rows, parameters)
-        if sum(len(other.image) for other in list(_templates.values())) > _TEMPLATE_BYTES:
-            _templates.clear()
-        _templates[key] = template
+        if sum(len(other.image) for other in list(TEMPLATES.values())) > _TEMPLATE_BYTES:
+            TEMPLATES.clear()
+        TEMPLATES[key] = template
     return template.filled(rows, parameters)
 
 

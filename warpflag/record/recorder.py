@@ -40,7 +40,7 @@ from warpflag.record.rows import Rows
 
 __all__ = ["Recorder"]
 
-_MOST_KEPT = 1000  # frames: 0.2 MB of a cell with two flagella
+MOST_KEPT = 1000  # frames: 0.2 MB of a cell with two flagella
 _BLOCK_SECONDS = 2.0  # after which pending frames are committed: what a killed run loses at most
 
 
@@ -66,11 +66,12 @@ class Recorder:
         resume_step: int | None = None,
         block_frames: int = 10,
         keep_open: bool = True,
+        most_kept: int = MOST_KEPT,
         clock: Callable[[], float] = time.monotonic,
     ):
         self.path = Path(path)
         self._resume_step = resume_step
-        self._block_frames, self._keep_open = block_frames, keep_open
+        self._block_frames, self._keep_open, self._most_kept = block_frames, keep_open, most_kept
         self._clock = clock
         self._started = False  # the file is there, open or not
         self._first_rows: dict[str, NDArray[Any]] = {}  # all that is committed, while that is less than a block
@@ -237,7 +238,7 @@ class Recorder:
 
     def _keep(self, rows: Mapping[str, NDArray[Any]], count: int) -> None:
         """Keeps what is small of a record that is not long."""
-        if count > _MOST_KEPT or (self._committed and not self._kept):
+        if count > self._most_kept or (self._committed and not self._kept):
             self._kept = None
         if self._kept is not None:
             for name in rows.keys() - {POSITION, E1, FORM, CHECKSUMS}:

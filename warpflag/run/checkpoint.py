@@ -25,7 +25,7 @@ __all__ = ["CheckpointError", "exists", "load", "name", "save", "write"]
 
 _TEMPORARY = "checkpoint.tmp"
 
-_LONGEST_ZIP = 1 << 31  # bytes: what is longer needs another format of zip
+LONGEST_ZIP = 1 << 31  # bytes: what is longer needs another format of zip
 _KEPT = 2  # the newest, and one to fall back to where that is damaged
 _NAME = re.compile(r"checkpoint-(\d+)\.npz")
 
@@ -69,7 +69,7 @@ def write(
     # Prefixed, so that an array may have any name; npz keeps a CRC of each entry, which loading checks.
     entries: dict[str, Any] = {f"array.{own}": array for own, array in arrays.items()}
     with open(Path(directory) / _TEMPORARY, "wb") as file:
-        file.write(_npz({"meta": np.array(json.dumps(dict(meta))), **entries}))
+        file.write(npz_bytes({"meta": np.array(json.dumps(dict(meta))), **entries}))
         if sync:
             file.flush()
             os.fsync(file.fileno())
@@ -131,13 +131,18 @@ def exists(directory: str | Path) -> bool:
     return bool(_numbered(Path(directory)))
 
 
-def _npz(arrays: Mapping[str, Any]) -> bytes:
-    """Arrays as the bytes of a file of NumPy, as `np.savez` writes it, which takes ten times as long for small ones."""
+def npz_bytes(arrays: Mapping[str, Any], longest: int = LONGEST_ZIP) -> bytes:
+    """Arrays as the bytes of a file of NumPy, as `np.savez` writes it, which takes ten times as long for small ones.
+
+    Args:
+        arrays: by name.
+        longest: size from which `np.savez` itself writes them [bytes].
+    """
     content, directory = bytearray(), bytearray()
     for name, array in arrays.items():
         array = np.asarray(array, order="C")
         entry, data = f"{name}.npy".encode(), _header(array.dtype.str, array.shape) + array.tobytes()
-        if len(content) + len(data) > _LONGEST_ZIP:
+        if len(content) + len(data) > longest:
             file = io.BytesIO()
             np.savez(file, **dict[str, Any](arrays))
             return file.getvalue()

@@ -89,7 +89,7 @@ def write_whole(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def settings_sha256(scene: Scene, text: str | None = None) -> str:
+def settings_sha256(scene: Scene, text: str | None = None, defaults: str | None = None) -> str:
     """Hash of everything in a scene but duration, frames and behaviour: equal hashes mean the same motion.
 
     Only what differs from the defaults counts, so that a setting that a later version adds changes nothing.
@@ -97,17 +97,22 @@ def settings_sha256(scene: Scene, text: str | None = None) -> str:
     Args:
         scene: what is run.
         text: the scene as TOML, where it is at hand.
+        defaults: the scene of defaults alone as TOML; None: this version's.
     """
     values = settings_of(scene, text)
-    default = {**_default_settings(), "name": values["name"]}
+    default = _default_settings() if defaults is None else settings_of(_DEFAULT, defaults)
+    default = {**default, "name": values["name"]}
     lines = [f"{key} = {value}" for key, value in values.items() if value != default.get(key, "none")]
     chosen = sorted(line for line in lines if line.partition(" ")[0] not in _NOT_OF_THE_MOTION)
     return hashlib.sha256("\n".join(chosen).encode()).hexdigest()
 
 
+_DEFAULT = Scene(name="default")
+
+
 @functools.cache
 def _default_settings() -> dict[str, str]:
-    return settings_of(Scene(name="default"))
+    return settings_of(_DEFAULT)
 
 
 def is_of_scene(meta: Mapping[str, Any], scene: Scene, texts: Iterable[str]) -> bool:

@@ -107,6 +107,7 @@ class ImplicitStepper:
         history: increments of the last two steps.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the pose that was linearised last.
         contacts, law: structs `Contacts` and `ContactLaw`.
+        motors: the struct `MotorSolve`.
     """
 
     def __init__(self, system: System, scenes: Sequence[Scene]) -> None:
@@ -122,7 +123,7 @@ class ImplicitStepper:
         self.law, self.flow = delassus.allocate(model, self.contacts), step_flow.allocate(model)
         quasi_newton.allocate(model, self.contacts, self.law)
         self.data, self.balance = collocation.allocate(model), balance.allocate(model)
-        self._motor_law, self._motors = model.switches.has("motor law"), motor_solve.allocate(model)
+        self._motor_law, self.motors = model.switches.has("motor law"), motor_solve.allocate(model)
         fixed = [scene.numerics.time_step for scene in scenes]
         self.steps = allocated_control(scenes, [bool(f) for f in fixed], model.device)
         # Without flows between nodes the matrix is the whole of the linearised equations.
@@ -160,7 +161,7 @@ class ImplicitStepper:
         linearised.set_stiffness(model, state, self.stiffness)
         linearised.factorise(model, state, self.stiffness, band)
         if self._motor_law:
-            motor_solve.prepare(model, state, band, self._motors)
+            motor_solve.prepare(model, state, band, self.motors)
         solution = self._solve(x.last_at_first, x.expected, i.begun, first=True)
         prediction.join(model, state, i, x.expected, solution, x.joined)
         # The second, where the first one led.
@@ -230,7 +231,7 @@ class ImplicitStepper:
             wp.capture_if(self.stability.any_strong, self._solve_in_full)
         if self._motor_law:
             motor_solve.solve(
-                model, state, self.data, self.band, self.law.gain, self._motors, last, found, weight, self._solution
+                model, state, self.data, self.band, self.law.gain, self.motors, last, found, weight, self._solution
             )
         return self._solution
 

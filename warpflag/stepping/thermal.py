@@ -142,7 +142,7 @@ class ThermalStepper:
         reconstruction.reconstruct(model, state, s.chart)
         noise.draw_local(model, state, s.control, self.noise, drifting=explicit)
         if explicit:
-            self._draw_flows(in_single=False)
+            self.draw_flows(in_single=False)
             self._add_divergence()
             launch_right_hand_side(model, state)
         else:
@@ -168,7 +168,7 @@ class ThermalStepper:
         equilibrium.finish_step(model, state, parts, explicit)
         clock.count_pass(s.control, model.device)
 
-    def _draw_flows(self, in_single: bool) -> None:
+    def draw_flows(self, in_single: bool) -> None:
         """Thermal velocities of the pair sum, and of the flow round the body, at the pose of the step's start.
 
         Args:
@@ -213,7 +213,7 @@ class ThermalStepper:
             parts.law.force.zero_()  # velocities are found without contacts: their closest points are yet to change
         if self._flows:
             step_flow.build(model, state, self.flow, parts.contacts if self._touching else None)
-        self._draw_flows(in_single=step_flow.stores_pairs(model))
+        self.draw_flows(in_single=step_flow.stores_pairs(model))
         for term in self._smooth_terms:
             if term.launch is not None:
                 term.launch(model, state)
