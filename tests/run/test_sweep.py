@@ -22,7 +22,6 @@ from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
 from warpflag.run.sweep import Sweep
 from warpflag.run.sweep.pool import best_size
-from warpflag.run.sweep.sweep import SweepRun
 from warpflag.scene import dumps
 
 BASE = {"duration": 4e-5, "frames": 4, "flagella.length": 1.0}
