@@ -121,7 +121,9 @@ CONSTANTS = {
     "step_control.REJECTED": Constant("stepping.step_control", (5.0, 2.0, 3.0, 10.0, 25.0), (*UPSET, "contact")),
     "accuracy.CORRELATION": Constant("stepping.accuracy", (5e-6, 1e-9, 2e-6, 1e-5, 2e-5), (*TWO, "crowd", "hard")),
     "step_control.SAFETY": Constant("stepping.step_control", (0.8, 0.4, 0.6, 1.0, 1.3), (*TWO, "crowd")),
-    "step_control.MEMORY": Constant("stepping.step_control", (20.0, 3.0, 8.0, 50.0, 1e3), (*TWO, "crowd", "hard")),
+    "step_control.FADING_STEPS": Constant(
+        "stepping.step_control", (20.0, 3.0, 8.0, 50.0, 1e3), (*TWO, "crowd", "hard")
+    ),
     "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
     "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), UPSET),
     "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), UPSET),

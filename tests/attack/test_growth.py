@@ -10,7 +10,7 @@ import pytest
 
 from tests.runs import small, summary
 from warpflag.run import execute, run
-from warpflag.run.growth import SPAN, Growth, chosen, growth, growth_words
+from warpflag.run.growth import FOLLOWED, Growth, chosen, growth, growth_words
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended
 from warpflag.scene import paper_scene, with_values
@@ -30,7 +30,7 @@ def test_a_steady_motion_magnifies_little_and_an_unstable_one_is_told():
     simulation.advance(2e-5)
     found = growth(scene, [simulation.cell_state()], simulation.first_node, "cpu", 1e-6)
     assert found is not None and 0.01 < found.factor < 20.0 and found.start == simulation.times[0]
-    assert 1e-5 <= found.within <= SPAN and not found.unstable
+    assert 1e-5 <= found.within <= FOLLOWED and not found.unstable
     assert growth_words(found) == "" == growth_words(None)
     assert "grows 4.2e+03 times in 0.05 ms from 0.3 ms on" in growth_words(Growth(4200.0, 3e-4, 5e-5))
     assert growth(scene, [simulation.cell_state()], simulation.first_node, "cpu", 1e-6, patience=0.0) is None
@@ -98,24 +98,24 @@ def still(time):
 
 
 def test_the_largest_growth_is_told_of_all_looks_and_starts(monkeypatch):
-    """Pairs that part and meet again, farthest in the middle of `SPAN`."""
-    parting(monkeypatch, lambda until: 1.0 + 10.0 * np.sin(np.pi * until / SPAN))
+    """Pairs that part and meet again, farthest in the middle of `FOLLOWED`."""
+    parting(monkeypatch, lambda until: 1.0 + 10.0 * np.sin(np.pi * until / FOLLOWED))
     found = growth(small(), [still(1e-4), still(2e-4)], np.array([0, 11, 22]), "cpu", 2e-7)
     largest = np.linalg.norm(np.random.default_rng(0).standard_normal((10, 3)), axis=1).max() / 3**0.5
     assert found is not None and not found.unstable
-    assert found.within == pytest.approx(SPAN / 2) and found.factor >= 11.0 * largest * (1 - 1e-9)
+    assert found.within == pytest.approx(FOLLOWED / 2) and found.factor >= 11.0 * largest * (1 - 1e-9)
     assert found.start == 1e-4
 
 
 def test_growth_at_a_known_rate_is_found(monkeypatch):
-    """Two cells that part at a rate that doubles their distance ten times in `SPAN`; looks are a tenth of it apart."""
-    made = parting(monkeypatch, lambda until: 2.0 ** (10.0 * until / SPAN))
+    """Two cells whose distance doubles ten times in `FOLLOWED`; looks are a tenth of it apart."""
+    made = parting(monkeypatch, lambda until: 2.0 ** (10.0 * until / FOLLOWED))
     scene, state = small({"numerics.accuracy": 1e-3}), still(3e-4)
     found = growth(scene, [state], np.array([0, 11, 22]), "cpu", 2e-7)
     largest = np.linalg.norm(np.random.default_rng(0).standard_normal((10, 3)), axis=1).max() / 3**0.5
     assert found is not None and found.unstable and found.start == 3e-4
-    assert found.factor > largest * 2.0 ** (10.0 * found.within / SPAN) * (1 - 1e-9)
-    assert found.within == pytest.approx(SPAN * 0.6) or found.within == pytest.approx(SPAN * 0.7)
+    assert found.factor > largest * 2.0 ** (10.0 * found.within / FOLLOWED) * (1 - 1e-9)
+    assert found.within == pytest.approx(FOLLOWED * 0.6) or found.within == pytest.approx(FOLLOWED * 0.7)
     assert all(own.numerics.time_step == 2e-7 and own.numerics.accuracy is None for own in made[0])
 
     def stop():

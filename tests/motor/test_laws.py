@@ -207,13 +207,13 @@ def test_torques_of_a_step_are_those_of_the_dense_equations(precision, device):
     s.law.gain.fill_(gain)
     s.data.ratio.fill_(0.6)
     held = np.array([0.8, 1.0, 0.2])
-    b.state.optional.motor.held.assign(held)
+    b.state.optional.motor.within_step.assign(held)
     random, size = np.random.default_rng(3), 6 + 4 * b.count
     last, found, x = (2e-3 * random.uniform(-1, 1, size) for _ in range(3))
     last, found, given = (b.increment(y[:6], y[6:].reshape(-1, 4)) for y in (last, found, x))
     motor_solve.prepare(b.model, b.state, band, s.motors)
     motor_solve.solve(b.model, b.state, s.data, band, s.law.gain, s.motors, last, found, s.data.one, given)
-    torques, solution = b.state.optional.motor.held.numpy().astype(float), flat(given)
+    torques, solution = b.state.optional.motor.within_step.numpy().astype(float), flat(given)
     # What a torque T_k adds: P of the load on its tripod and on the body.
     system, mobility = dense_system(exact, step, weight), exact.mobility("none")
     turns = np.zeros((3, size))

@@ -81,7 +81,7 @@ def test_forces_belong_to_the_thermal_velocities(name, precision, device):
         assert np.linalg.norm(g[6:] - inverse) < ROOT[precision] * np.linalg.norm(inverse)
     after = Draw([scene], [later], device)
     kept = after.stepper.drift
-    for member in mean_drift.MEMORY:
+    for member in mean_drift.CARRIED:
         getattr(kept, member).assign(getattr(drift, member))
     for array in ("force", "velocity", "body_velocity", "body_spin", "flagellum_force", "flagellum_torque"):
         getattr(after.state.data, array).zero_()

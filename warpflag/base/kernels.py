@@ -19,7 +19,7 @@ from warpflag.base.streams import is_terminal, tell
 __all__ = ["load_kernels", "noted_launches"]
 
 _MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
-PATIENCE = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
+EXPLAINED_AFTER = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
 _SECONDS_PER_LOOK = 0.2  # between two counts of what has been compiled: five a second
 _SOUND: set[Path] = set()  # folders of the modules that this process has loaded
 
@@ -52,14 +52,16 @@ def noted_launches() -> Iterator[set[tuple[Any, int | None]]]:
             setattr(wp, name, function)
 
 
-def load_kernels(launch: Callable[[], None], device: Any, quiet: bool = False, patience: float = PATIENCE) -> None:
+def load_kernels(
+    launch: Callable[[], None], device: Any, quiet: bool = False, explained_after: float = EXPLAINED_AFTER
+) -> None:
     """Loads the kernels that a function launches; several modules at once are compiled where they are not in the cache.
 
     Args:
         launch: launches them; nothing of it is run, and arrays stay as they are.
         device: of Warp.
         quiet: say nothing; otherwise compiling that lasts is explained on standard error.
-        patience: how long it may last unexplained [s].
+        explained_after: how long it may last without a word [s].
     """
     with noted_launches() as noted:
         launch()
@@ -76,7 +78,7 @@ def load_kernels(launch: Callable[[], None], device: Any, quiet: bool = False, p
         for module, block in waiting:
             _load(module, block, device)
     else:
-        with _explained(missing, quiet, patience):
+        with _explained(missing, quiet, explained_after):
             pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores()))
             try:
                 for loaded in [pool.submit(_load, module, block, device) for module, block in waiting]:
@@ -92,12 +94,12 @@ def _load(module: Any, block: int | None, device: Any) -> None:
 
 
 @contextlib.contextmanager
-def _explained(missing: set[Path], quiet: bool, patience: float) -> Iterator[None]:
+def _explained(missing: set[Path], quiet: bool, explained_after: float) -> Iterator[None]:
     """While it lasts, says how many of the modules that were missing are in the cache; nothing if it does not last."""
     over = threading.Event()
 
     def explain() -> None:
-        if over.wait(patience):
+        if over.wait(explained_after):
             return
         kind = f"compiling {len(missing)} modules of kernels, once for each kind of scene on each machine"
         tell(f"{kind}, up to two minutes; kept in {kernel_folder()}")

@@ -25,9 +25,9 @@ from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended
 from warpflag.scene import Scene, SceneError, with_values
 
-__all__ = ["PATIENCE", "SPAN", "UNSTABLE", "Growth", "State", "chosen", "growth", "growth_words"]
+__all__ = ["FOLLOWED", "PATIENCE", "UNSTABLE", "Growth", "State", "chosen", "growth", "growth_words"]
 
-SPAN = 1.0e-4
+FOLLOWED = 1.0e-4
 """Simulated time for which a disturbance is followed [s]."""
 UNSTABLE = 100.0
 """Growth in that time from which a motion is called unstable; that of a bundle that zips is below ten."""
@@ -80,7 +80,7 @@ def chosen(record: Record, worst_end: float | None) -> Iterable[Frame]:
         worst_end: end of the window with its worst estimate [s]; None: there is none.
     """
     last = record.frame_count - 1
-    begin = np.searchsorted(record.times, (worst_end or 0.0) - SPAN, side="right") - 1
+    begin = np.searchsorted(record.times, (worst_end or 0.0) - FOLLOWED, side="right") - 1
     for index in dict.fromkeys((max(int(begin), 0), last, 0, last // 2)):
         yield record.frame(index)
 
@@ -94,7 +94,7 @@ def growth(
     patience: float = PATIENCE,
     check: Callable[[], None] = lambda: None,
 ) -> Growth | None:
-    """The largest growth of a disturbance within `SPAN` of one of some states, or the first that is unstable.
+    """The largest growth of a disturbance within `FOLLOWED` of one of some states, or the first that is unstable.
 
     Args:
         scene: of the cell.
@@ -147,7 +147,7 @@ def _looks(
         starts = [start, dataclasses.replace(start, positions=tuple(moved))]
         pair = Simulation([followed, followed], device=device, starts=starts)
         for k in range(_LOOKS):
-            within = SPAN * (k + 1) / _LOOKS
+            within = FOLLOWED * (k + 1) / _LOOKS
             pair.advance(within, watch)
             one, two = np.split(pair.cells().positions, 2)
             yield Growth(float(np.linalg.norm(one - two, axis=1).max()) / size, state.time, within)

@@ -271,11 +271,11 @@ class ImplicitStepper:
         names = ("last_step", "step_before", "history", "evaluations", "over_implicit", "share")
         kept = {name: getattr(self.data, name).numpy().copy() for name in names}
         kept |= step_memory(self.steps)
-        kept |= {f"balance_{name}": getattr(self.balance, name).numpy().copy() for name in balance.MEMORY}
+        kept |= {f"balance_{name}": getattr(self.balance, name).numpy().copy() for name in balance.CARRIED}
         if self.stability is not None:
             kept |= {name: getattr(self.stability, name).numpy().copy() for name in _STABILITY_MEMORY}
         if self._motor_law:
-            kept["held_torque"] = self._system.state.optional.motor.held.numpy().copy()
+            kept["held_torque"] = self._system.state.optional.motor.within_step.numpy().copy()
         for name, x in self._increments_kept().items():
             kept |= {f"{name}_node": x.node.numpy().copy(), f"{name}_body": x.body.numpy().copy()}
         return kept
@@ -285,7 +285,7 @@ class ImplicitStepper:
         for name, values in recalled(self.steps, memory).items():
             whose, _, part = name.partition("_")
             if name == "held_torque":
-                self._system.state.optional.motor.held.assign(values)
+                self._system.state.optional.motor.within_step.assign(values)
             elif part in ("node", "body"):
                 getattr(kept[whose], part).assign(values)
             elif whose == "balance":

@@ -44,7 +44,7 @@ EULER_SHARE = 0.05
 RENEWALS = 1
 """How often closest points are found anew where the step leads, before the full mobility is solved with; two change
 nothing beyond 1 %, none leaves contact energies of parallel filaments 30 % too large at 1e-6 s."""
-PRODUCTS = 8
+GMRES_PRODUCTS = 8
 """Of GMRES: at 1e-5 s six leave the bends of two filaments 0.05 um apart 0.6 % colder than twelve, eight 0.2 %."""
 
 
@@ -122,7 +122,7 @@ class ThermalStepper:
                 # There is no earlier step: its ratio to this one is zero.
                 self._data, self._none = collocation.allocate(model), chain_chart.allocate(model)
             if self._flows:
-                self._krylov = krylov.allocate(model, PRODUCTS)
+                self._krylov = krylov.allocate(model, GMRES_PRODUCTS)
                 self.stability = stability.allocate(model)
                 self._in_contact = stability.allocate(model)
                 self._change, self._by_contacts = chain_chart.allocate(model), chain_chart.allocate(model)
@@ -301,7 +301,7 @@ class ThermalStepper:
         """What an implicit step leaves to the next one."""
         if self._explicit:
             return {}
-        return {"owed": self._work.owed} | {f"drift_{name}": getattr(self.drift, name) for name in mean_drift.MEMORY}
+        return {"owed": self._work.owed} | {f"drift_{name}": getattr(self.drift, name) for name in mean_drift.CARRIED}
 
     def restart(self) -> None:
         """Nothing is left over from earlier steps."""
@@ -314,7 +314,7 @@ class ThermalStepper:
         if self.lanczos is not None:
             kept["noise_products"] = self.lanczos.data.total.numpy().copy()
         if self.motors is not None:
-            kept["held_torque"] = self._system.state.optional.motor.held.numpy().copy()
+            kept["held_torque"] = self._system.state.optional.motor.within_step.numpy().copy()
             kept["average_rate"] = self.motors.average.numpy().copy()
         return kept
 
@@ -325,5 +325,5 @@ class ThermalStepper:
         if self.lanczos is not None:
             self.lanczos.data.total.assign(memory["noise_products"])
         if self.motors is not None:
-            self._system.state.optional.motor.held.assign(memory["held_torque"])
+            self._system.state.optional.motor.within_step.assign(memory["held_torque"])
             self.motors.average.assign(memory["average_rate"])

@@ -157,7 +157,7 @@ def structs(p: Precision) -> SimpleNamespace:
         """Per flagellum [K]; only where the torque is not constant."""
 
         torque: wp.array(dtype=real)  # at the moment evaluated [pN um]
-        held: wp.array(dtype=real)  # in an implicit step [pN um]
+        within_step: wp.array(dtype=real)  # in an implicit step [pN um]
         slope: wp.array(dtype=real)  # of the piece of its curve that it was on last [pN um s]
         on_hook: wp.array(dtype=real)  # at the end of the last step; only with a hook that stiffens by it [pN um]
 
@@ -317,7 +317,7 @@ def allocate_state(model: DeviceModel) -> tuple[Any, SimpleNamespace]:
         s.time = zeros(cells, wp.float64)
     parts = optional(structs(p).State)
     if model.switches.has("motor law"):
-        for name in ("torque", "held", "slope"):
+        for name in ("torque", "within_step", "slope"):
             setattr(parts.motor, name, zeros(flagella, p.real))
         if model.switches.has("hook that stiffens"):
             parts.motor.on_hook = wp.clone(model.data.motor.torque)

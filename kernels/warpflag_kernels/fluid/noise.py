@@ -28,7 +28,7 @@ from warpflag_kernels.base import random_numbers
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
-ROUND_OFF = 1.0e-6  # of roots of a shell's mobility over the largest; below, the body is held in that direction
+LEAST_ROOT = 1.0e-6  # of roots of a shell's mobility over the largest; below, the body is held in that direction
 
 
 @functools.cache
@@ -69,7 +69,7 @@ def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
     if model.switches.flows.body:
         values, vectors = np.linalg.eigh(model.data.body.shell_mobility.numpy().reshape(-1, 6, 6).astype(np.float64))
         roots = np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        sound = roots > ROUND_OFF * roots.max(axis=2, keepdims=True)
+        sound = roots > LEAST_ROOT * roots.max(axis=2, keepdims=True)
         inverses = np.where(sound, 1.0 / np.where(sound, roots, 1.0), 0.0)
         turned = np.swapaxes(vectors, 1, 2)
         n.body_root = wp.array(((vectors * roots) @ turned).ravel(), dtype=p.real, device=device)

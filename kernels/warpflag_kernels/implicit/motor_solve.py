@@ -192,7 +192,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
             while k < end:
                 mobility = per_step * motors.answer.node[model.first_node[k]][3]
                 free = motors.free_rate[k] + per_step * wp.dot(motors.by_body[k], moved)
-                passive_rate = free - mobility * state.motor[0].held[k]
+                passive_rate = free - mobility * state.motor[0].within_step[k]
                 drive = drive_at(model, k, state.time[c])
                 if wp.static(averaged):
                     torque, softness, slope = law_of(model, band, motors, k, c, drive, mobility, passive_rate)
@@ -201,7 +201,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
                 if slope != state.motor[0].slope[k]:
                     changed = True
                 state.motor[0].slope[k] = slope
-                motors.change[k] = torque - state.motor[0].held[k]
+                motors.change[k] = torque - state.motor[0].within_step[k]
                 remaining -= motors.change[k] * motors.on_body[k]
                 jacobian += wp.outer(motors.on_body[k], (softness * per_step) * motors.by_body[k])
                 k += 1
@@ -213,8 +213,8 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         motors.moved[c] = g * moved
         k = begin
         while k < end:
-            state.motor[0].held[k] = state.motor[0].held[k] + motors.change[k]
-            state.motor[0].torque[k] = state.motor[0].held[k]
+            state.motor[0].within_step[k] = state.motor[0].within_step[k] + motors.change[k]
+            state.motor[0].torque[k] = state.motor[0].within_step[k]
             k += 1
 
     @wp.kernel(module=module)
@@ -291,7 +291,7 @@ def solve(
     weight: Any,
     x: Any,
 ) -> None:
-    """Puts every motor on its law: the torques in `State.motor.held`, and what their changes do to an increment.
+    """Puts every motor on its law: the torques in `State.motor.within_step`, and what their changes do to an increment.
 
     Args:
         model, state: of the batch, with the pose that x is an increment of, at the time of the collocation point.

@@ -17,7 +17,7 @@ The slope is a thousand times the drag of the tripod, so torques are found in cl
 itself from a curve of straight pieces; w from the three linear equations that remain, repeated while some motor changes
 its piece. That is Newton's method on a monotone map of straight pieces, and it ends in the exact solution.
 
-Within an implicit step the torque is a number, `State.motor.held`, which `implicit/motor_solve.py` finds.
+Within an implicit step the torque is a number, `State.motor.within_step`, which `implicit/motor_solve.py` finds.
 """
 
 import functools
@@ -192,7 +192,7 @@ def _functions(p: Precision) -> SimpleNamespace:
 
 
 @functools.cache
-def _held_functions(p: Precision) -> SimpleNamespace:
+def _functions_within_step(p: Precision) -> SimpleNamespace:
     """Device functions of the torques that a step holds at present."""
     real, vec3, Model, State = p.real, p.vec3, structs(p).Model, structs(p).State
     module = p.module("held_motor_functions")
@@ -200,12 +200,12 @@ def _held_functions(p: Precision) -> SimpleNamespace:
     @wp.func(module=module)
     def on_spin(model: Model, state: State, e: wp.int32, k: wp.int32, torque: real):
         if e == model.first_node[k]:
-            return torque + state.motor[0].held[k]
+            return torque + state.motor[0].within_step[k]
         return torque
 
     @wp.func(module=module)
     def on_body(model: Model, state: State, k: wp.int32, force: vec3, torque: vec3):
-        return force, torque - state.motor[0].held[k] * state.pose.tangent[model.first_node[k]]
+        return force, torque - state.motor[0].within_step[k] * state.pose.tangent[model.first_node[k]]
 
     return SimpleNamespace(on_spin=on_spin, on_body=on_body)
 
@@ -213,6 +213,6 @@ def _held_functions(p: Precision) -> SimpleNamespace:
 MOTOR_LAW = Term(
     "motor law",
     functions=_functions,
-    within_step=Term("held motor", functions=_held_functions, timed=True),
+    within_step=Term("motor within a step", functions=_functions_within_step, timed=True),
     timed=True,
 )

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.picture.rays import FAR, MODULE, Capsules, capsule_hit, is_dark, nearest_hit
+from warpflag_kernels.picture.rays import MODULE, NO_HIT, Capsules, capsule_hit, is_dark, nearest_hit
 
 SAMPLES = 3
 """Rays along each side of a pixel that shows more than background."""
@@ -192,7 +192,7 @@ def _paint(
     if empty:
         side = 0
     rays = _SampleRays()
-    nearest = _SampleDistances(FAR)
+    nearest = _SampleDistances(NO_HIT)
     hits = _SampleHits(-1)
     count = side * side
     for k in range(count):
@@ -202,7 +202,7 @@ def _paint(
     # One walk through the tree for all of them: its boxes are wider by a pixel.
     if not empty:
         index = int(0)
-        farthest = float(FAR)
+        farthest = float(NO_HIT)
         query = wp.bvh_query_ray(capsules.bvh, view.eye, ray_through(view, float(column) + 0.5, float(row) + 0.5))
         while wp.bvh_query_next(query, index, farthest):
             start, end, radius = capsules.start[index], capsules.end[index], capsules.radius[index]

@@ -5,7 +5,7 @@ Lengths in um, seen from a centre near the scene: single precision is enough.
 
 import warp as wp
 
-FAR = wp.constant(1.0e9)
+NO_HIT = wp.constant(1.0e9)
 """The distance of a ray that hits nothing [um]."""
 
 MODULE = wp.get_module("warpflag_kernels.raycast")
@@ -26,7 +26,7 @@ class Capsules:
 
 @wp.func
 def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec3, radius: wp.float32):
-    """Distance along a ray to where it enters a capsule; FAR where it doesn't."""
+    """Distance along a ray to where it enters a capsule; NO_HIT where it doesn't."""
     # Seen from the point of the ray beside the capsule: the squares below stay small.
     shift = wp.dot(0.5 * (start + end) - origin, direction)
     from_start = origin + shift * direction - start
@@ -42,7 +42,7 @@ def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec
     if a > 1.0e-7 * axis_axis:
         root = b * b - a * c
         if root < 0.0:
-            return FAR
+            return NO_HIT
         t = (-b - wp.sqrt(root)) / a
         along = axis_from + t * axis_ray
         if along > 0.0 and along < axis_axis:
@@ -55,14 +55,14 @@ def capsule_hit(origin: wp.vec3, direction: wp.vec3, start: wp.vec3, end: wp.vec
     b = wp.dot(direction, from_cap)
     root = b * b - wp.dot(from_cap, from_cap) + radius * radius
     if root < 0.0:
-        return FAR
+        return NO_HIT
     return shift - b - wp.sqrt(root)
 
 
 @wp.func
 def nearest_hit(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
-    """Distance to the first capsule on a ray and its index, or FAR and -1."""
-    nearest = FAR
+    """Distance to the first capsule on a ray and its index, or NO_HIT and -1."""
+    nearest = NO_HIT
     hit = int(-1)
     index = int(0)
     query = wp.bvh_query_ray(capsules.bvh, origin, direction)
@@ -81,6 +81,6 @@ def is_dark(capsules: Capsules, origin: wp.vec3, direction: wp.vec3):
     query = wp.bvh_query_ray(capsules.bvh, origin, direction)
     while wp.bvh_query_next(query, index):
         t = capsule_hit(origin, direction, capsules.start[index], capsules.end[index], capsules.radius[index])
-        if t > 0.0 and t < FAR:
+        if t > 0.0 and t < NO_HIT:
             return True
     return False

@@ -39,7 +39,7 @@ from warpflag_kernels.rod import chain_chart, comoving_chart, polymorphs, rotati
 # those before the step's last correction, so they may exceed what is dissipated by far.
 MOST_DISSIPATED = 2.0
 # Round-off of the energy, over the bound above: strains come from some operations each.
-ROUND_OFF = 4.0
+ENERGY_ROUND_OFF = 4.0
 # A violation counts as WEIGHT steps that keep the balance: where more than one step in ten violates it, the count
 # grows, and beyond LASTING, some twenty violations more than that, the cell is stopped.
 WEIGHT = 9
@@ -73,7 +73,7 @@ def struct(p: Precision) -> Any:
     return Balance
 
 
-MEMORY = ("stored", "known", "refused", "lasting")
+CARRIED = ("stored", "known", "refused", "lasting")
 """What goes on from step to step."""
 
 
@@ -210,7 +210,7 @@ def functions(p: Precision) -> SimpleNamespace:
     Balance = struct(p)
     module = p.module("balance_functions")
     most = wp.constant(wp.float64(MOST_DISSIPATED))
-    round_off = wp.constant(wp.float64(ROUND_OFF * 2.0 * np.finfo(p.name).eps))
+    round_off = wp.constant(wp.float64(ENERGY_ROUND_OFF * 2.0 * np.finfo(p.name).eps))
     weight, lasting = wp.constant(wp.int32(WEIGHT)), wp.constant(wp.int32(LASTING))
 
     @wp.func(module=module)

@@ -32,8 +32,8 @@ REJECTED = 5.0  # a step is repeated if its estimate exceeds what it may make by
 # The same for errors of equal sign, those of RKC. In float32 they are round-off that shorter steps don't lower.
 REJECTED_SYSTEMATIC = 25.0
 SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
-MEMORY = 20.0  # over how many steps that mean fades
-MEMORY_SYSTEMATIC = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
+FADING_STEPS = 20.0  # over how many steps that mean fades
+FADING_TIME = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
 # Shortest steps in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in water as
 # long as MEMORY_SYSTEMATIC, in thinner fluids shorter.
 LOWERING = 25000.0
@@ -97,8 +97,8 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
     rejection = wp.constant(wp.float64(REJECTED if independent else REJECTED_SYSTEMATIC))
     safety = wp.constant(wp.float64(SAFETY))
-    memory = wp.constant(wp.float64(MEMORY if independent else MEMORY_SYSTEMATIC))
-    forgotten, per_step = wp.constant(wp.float64(FORGOTTEN)), wp.constant(wp.float64(math.exp(-1.0 / MEMORY)))
+    memory = wp.constant(wp.float64(FADING_STEPS if independent else FADING_TIME))
+    forgotten, per_step = wp.constant(wp.float64(FORGOTTEN)), wp.constant(wp.float64(math.exp(-1.0 / FADING_STEPS)))
     round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump = wp.constant(wp.float64(JUMP))

@@ -37,7 +37,7 @@ from warpflag_kernels.fluid import body as body_stage
 from warpflag_kernels.fluid import lanczos as lanczos_stage
 from warpflag_kernels.fluid import noise as noise_stage
 
-MEMORY = ("force", "on_body", "velocity", "of_body")
+CARRIED = ("force", "on_body", "velocity", "of_body")
 
 
 @functools.cache
