@@ -216,7 +216,12 @@ def test_records_put_into_the_bytes_of_another_hold_what_hdf5_would_have_written
         )
         for recorder in (at_once, each):
             scene, size = f'name = "{k}"  # of a length of its own{"!" * (k // 2)}\n', 1.0 + k
-            options = {"filament_radius": size, "body_length": 2 * size, "body_width": 0.5, "versions": {"h5py": "3"}}
+            options = {
+                "filament_radius": size,
+                "body_length": 2 * size,
+                "body_width": 0.5,
+                "versions": {"h5py": f"{count}"},
+            }
             recorder.start(scene, FIRST_NODE, **options)
             for index in range(count):
                 recorder.write(frame(7 * k + index))

@@ -82,9 +82,9 @@ def allocate(model: DeviceModel, energies: Any, seeds: Any) -> Any:
 
 @functools.cache
 def functions(p: Precision, pairs: bool) -> SimpleNamespace:
-    """Device functions of the local part, with or without a pair sum: `self_mobility`,
-    `node_tangent`, `excess_root`, `drift`."""
-    real, vec3 = p.real, p.vec3
+    """Device functions of the local part, with or without a pair sum: `self_mobility`, `node_tangent`, `excess_root`,
+    `drift`, `axial_root`; and `shell_product` of the body."""
+    real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
     Model, State = structs(p).Model, structs(p).State
     four_thirds, two = wp.constant(real(4.0 / 3.0)), wp.constant(real(2.0))
     module = p.module("noise_functions", "pairs" if pairs else "")
@@ -140,7 +140,20 @@ def functions(p: Precision, pairs: bool) -> SimpleNamespace:
         part = wp.dot(axis, xi) * axis
         return wp.sqrt(along) * part + wp.sqrt(across) * (xi - part)
 
+    @wp.func(module=module)
+    def shell_product(matrix: wp.array(dtype=real), state: State, c: wp.int32, a: vec4, b: vec4):
+        """The 6 x 6 matrix of cell c, in body axes, times the deviates of its body: both halves, in lab axes."""
+        q = state.pose.body_orientation[c]
+        axes = wp.quat_to_matrix(p.quat(real(q[0]), real(q[1]), real(q[2]), real(q[3])))
+        xi = vec6(a[0], a[1], a[2], b[0], b[1], b[2])
+        found = vec6(real(0.0))
+        for i in range(6):
+            for j in range(6):
+                found[i] += matrix[36 * c + 6 * i + j] * xi[j]
+        return axes * vec3(found[0], found[1], found[2]), axes * vec3(found[3], found[4], found[5])
+
     return SimpleNamespace(
+        shell_product=shell_product,
         self_mobility=self_mobility,
         node_tangent=node_tangent,
         excess_root=excess_root,
@@ -156,6 +169,7 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool, drifting: bool)
     normals = random_numbers.functions(p).normals
     f = functions(p, pairs)
     self_mobility, excess_root, drift, root = f.self_mobility, f.excess_root, f.drift, f.axial_root
+    shell_product = f.shell_product
     zero, two = wp.constant(real(0.0)), wp.constant(real(2.0))
     for_node, for_shift, for_turn = (
         wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
@@ -210,15 +224,9 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool, drifting: bool)
         a = normals(noise.seed[c], 0, steps[c], for_shift)
         b = normals(noise.seed[c], 0, steps[c], for_turn)
         if wp.static(shell):
-            q = state.pose.body_orientation[c]
-            axes = wp.quat_to_matrix(p.quat(real(q[0]), real(q[1]), real(q[2]), real(q[3])))
-            xi = vec6(a[0], a[1], a[2], b[0], b[1], b[2])
-            found = vec6(zero)
-            for i in range(6):
-                for j in range(6):
-                    found[i] += noise.body_root[36 * c + 6 * i + j] * xi[j]
-            shift = scale * (axes * vec3(found[0], found[1], found[2]))
-            turn = scale * (axes * vec3(found[3], found[4], found[5]))
+            shift, turn = shell_product(noise.body_root, state, c, a, b)
+            shift = scale * shift
+            turn = scale * turn
             noise.body[c] = vec6(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
             return
         axis = state.pose.body_axis[c]

@@ -71,6 +71,7 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
     Noise, Lanczos = noise_stage.struct(p), lanczos_stage.struct(p)
     f = noise_stage.functions(p, pairs)
     self_mobility, node_tangent, axial_root = f.self_mobility, f.node_tangent, f.axial_root
+    shell_product = f.shell_product
     normals, respond = random_numbers.functions(p).normals, body_stage.mobility(p).respond
     most, zero = wp.constant(lanczos_stage.MOST_PRODUCTS), wp.constant(real(0.0))
     for_node, for_shift, for_turn = (
@@ -226,25 +227,18 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
         scale = real(wp.sqrt(wp.float64(0.5) * noise.energy[c] / step[c]))
         a = normals(noise.seed[c], 0, steps[c], for_shift)
         b = normals(noise.seed[c], 0, steps[c], for_turn)
-        shift = vec3(a[0], a[1], a[2])
-        turn = vec3(b[0], b[1], b[2])
         if wp.static(shell):
-            q = state.pose.body_orientation[c]
-            axes = wp.quat_to_matrix(p.quat(real(q[0]), real(q[1]), real(q[2]), real(q[3])))
-            xi = vec6(a[0], a[1], a[2], b[0], b[1], b[2])
-            forces = vec6(zero)
-            moves = vec6(zero)
-            for i in range(6):
-                for j in range(6):
-                    forces[i] += noise.body_inverse[36 * c + 6 * i + j] * xi[j]
-                    moves[i] += noise.body_root[36 * c + 6 * i + j] * xi[j]
-            force = scale * (axes * vec3(forces[0], forces[1], forces[2])) - state.surface_force[c]
-            torque = scale * (axes * vec3(forces[3], forces[4], forces[5])) - state.surface_torque[c]
-            u = scale * (axes * vec3(moves[0], moves[1], moves[2]))
-            w = scale * (axes * vec3(moves[3], moves[4], moves[5]))
+            force, torque = shell_product(noise.body_inverse, state, c, a, b)
+            force = scale * force - state.surface_force[c]
+            torque = scale * torque - state.surface_torque[c]
+            u, w = shell_product(noise.body_root, state, c, a, b)
+            u = scale * u
+            w = scale * w
         else:
             axis = state.pose.body_axis[c]
             m = model.body
+            shift = vec3(a[0], a[1], a[2])
+            turn = vec3(b[0], b[1], b[2])
             force = scale * inverse_root(axis, m.mobility_along[c], m.mobility_across[c], shift)
             torque = scale * inverse_root(axis, m.spin_mobility[c], m.tumble_mobility[c], turn)
             u = scale * axial_root(axis, m.mobility_along[c], m.mobility_across[c], shift)
