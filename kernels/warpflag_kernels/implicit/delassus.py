@@ -21,7 +21,7 @@ from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, structs
 from warpflag_kernels.contact import contact_list
-from warpflag_kernels.fluid import body_flow
+from warpflag_kernels.fluid import shell_flow
 from warpflag_kernels.implicit import block_band, body_coupling
 from warpflag_kernels.implicit import step_flow as flow_stage
 from warpflag_kernels.rod import chain_chart
@@ -152,7 +152,7 @@ def functions(p: Precision, flows: Flows, step_pairs: str, chains: str, threads:
     gap_change, body_load = jacobian.gap_change, jacobian.body_load
     segment_loads, node_loads = jacobian.segment_loads, jacobian.node_loads
     stored = step_pairs != "gathered"
-    beads = body_flow.functions(p, p.single, stored)
+    beads = shell_flow.functions(p, p.single, stored)
     axes_of, pull, answer, bead_flow = beads.axes_of, beads.pull, beads.answer, beads.flow_at_bead
     hold_row, sum_loads, load_rows, flow_at_node = beads.hold_row, beads.sum_loads, beads.load_rows, beads.flow_at_node
     module = p.module("delassus", f"{flows.variant}_{step_pairs}_{chains}_{threads}")

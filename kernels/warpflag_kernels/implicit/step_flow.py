@@ -22,7 +22,7 @@ from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list
-from warpflag_kernels.fluid import body_flow, node_velocity, rotne_prager
+from warpflag_kernels.fluid import body_flow, node_velocity, rotne_prager, shell_flow
 from warpflag_kernels.fluid import shell as shell_stage
 
 
@@ -179,7 +179,7 @@ def _kernels(p: Precision, touching: bool, flows: Flows, by_cells: bool) -> Simp
     real = p.single.real
     Model, State, Contacts, Flow = structs(p).Model, structs(p).State, contact_list.struct(p), struct(p)
     row_of = rows(p)
-    beads = body_flow.functions(p, p.single, by_cells)
+    beads = shell_flow.functions(p, p.single, by_cells)
     axes_of, place, find = beads.axes_of, beads.place, beads.find
     names = ["touching"] * touching + ["unequal"] * flows.unequal + ["body", *["cells"] * by_cells] * flows.body
     module = p.module("flow", "_".join(names))

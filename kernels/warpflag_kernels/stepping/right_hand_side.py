@@ -18,7 +18,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours
-from warpflag_kernels.fluid import body, body_flow, node_velocity, rotne_prager
+from warpflag_kernels.fluid import body, node_velocity, rotne_prager, shell_flow
 from warpflag_kernels.fluid import shell as shell_stage
 from warpflag_kernels.rod import forces
 
@@ -76,7 +76,7 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: F
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
     move_cell = node_velocity.functions(p, pair, flows, pair_sum).move_cell
-    beads = body_flow.functions(p, pair, stored=True)
+    beads = shell_flow.functions(p, pair, stored=True)
     obstruct, carry = beads.obstruct, beads.carry
     name = "_".join([variant(terms), flows.variant, pair_sum, *["short"] * (pair != p)])
 
