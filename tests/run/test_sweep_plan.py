@@ -239,7 +239,7 @@ def test_of_many_bad_members_the_first_are_named(folder):
 
 
 @pytest.mark.parametrize(("seen", "expected"), [(0.0, 8e-5), (5e-5, 8e-5), (1.2e-4, 1.2e-4)])
-def test_members_that_ended_count_with_all_that_they_reached(seen, expected, monkeypatch):
+def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
     """Whatever their worker last said of a batch: one is done, the other was stopped."""
 
     class Instant:
@@ -255,9 +255,8 @@ def test_members_that_ended_count_with_all_that_they_reached(seen, expected, mon
         def close(self):
             pass
 
-    monkeypatch.setattr(pool, "_Worker", Instant)
     scenes = [small(), small()]
-    with pool.Pool(["somewhere"], {}) as workers, Stop() as stop:
+    with pool.Pool(["somewhere"], {}, worker=Instant) as workers, Stop() as stop:
         workers.start(scenes[0], stop)
         workers.submit(pool.Batch([0, 1], [Path("0"), Path("1")], scenes))
         ended = []

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -56,7 +56,7 @@ class Batch:
     scenes: Sequence[Scene]
 
 
-class _Worker:
+class Worker:
     """One worker: the process, and the thread that talks with it.
 
     Args:
@@ -126,14 +126,21 @@ class Pool:
         devices: of the workers.
         options: of the runs: movies and checkpoint_seconds.
         starter: what forks workers on the CPU; ended with the block, too.
+        worker: makes one of a device and a starter.
     """
 
-    def __init__(self, devices: Sequence[str], options: Mapping[str, Any], starter: Starter | None = None) -> None:
-        self.devices, self._options, self._starter = list(devices), dict(options), starter
+    def __init__(
+        self,
+        devices: Sequence[str],
+        options: Mapping[str, Any],
+        starter: Starter | None = None,
+        worker: Callable[[str, Starter | None], Any] = Worker,
+    ) -> None:
+        self.devices, self._options, self._starter, self._worker = list(devices), dict(options), starter, worker
         self._queue: queue.Queue[Batch] = queue.Queue()
         self._finished: queue.Queue[tuple[Batch, list[Outcome], float]] = queue.Queue()
         self._open, self._done_time, self._ending = 0, 0.0, ""
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
         self._batch_ended = threading.Event()
 
     def __enter__(self) -> Pool:
@@ -157,7 +164,7 @@ class Pool:
                 starter = None
             finally:
                 stop.at_once = False
-        self._workers = [_Worker(device, starter) for device in self.devices]
+        self._workers = [self._worker(device, starter) for device in self.devices]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -244,7 +251,7 @@ class Pool:
             if worker.thread is not None:
                 worker.thread.join()
 
-    def _serve(self, worker: _Worker) -> None:
+    def _serve(self, worker: Worker) -> None:
         """Hands batches to a worker until none is left."""
         while not self._ending:
             try:
