@@ -65,7 +65,7 @@ def test_forces_belong_to_the_thermal_velocities(name, precision, device):
     stepper, drift = draw.stepper, draw.stepper.drift
     draw.local(2)
     stepper.draw_flows(in_single=False)
-    lanczos = stepper.lanczos.data if stepper.lanczos else mean_drift.lanczos_stage.struct(draw.model.precision)()
+    lanczos = stepper.lanczos.data if stepper.lanczos else mean_drift.lanczos_space.struct(draw.model.precision)()
     mean_drift.remember(draw.model, draw.state, draw.control, stepper.noise, lanczos, None, drift)
     g = np.concatenate([drift.on_body.numpy()[0], drift.force.numpy()[draw.moving].ravel()]).astype(np.float64)
     v = np.concatenate([drift.of_body.numpy()[0], drift.velocity.numpy()[draw.moving].ravel()]).astype(np.float64)

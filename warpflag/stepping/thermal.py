@@ -11,7 +11,7 @@ import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.base.types import DeviceModel, DeviceState
 from warpflag_kernels.contact import contact_list, search
-from warpflag_kernels.fluid import body, body_noise, lanczos, node_velocity, noise
+from warpflag_kernels.fluid import body, body_noise, lanczos, lanczos_space, node_velocity, noise
 from warpflag_kernels.implicit import (
     block_band,
     collocation,
@@ -231,7 +231,7 @@ class ThermalStepper:
         s, shell = self._system, None
         if s.model.switches.flows.body and step_flow.stores_pairs(s.model):
             shell = self.flow.shell
-        space = lanczos.struct(s.model.precision)() if self.lanczos is None else self.lanczos.data
+        space = lanczos_space.struct(s.model.precision)() if self.lanczos is None else self.lanczos.data
         mean_drift.remember(s.model, s.state, s.control, self.noise, space, shell, self.drift)
 
     def _solve(self) -> Any:

@@ -34,7 +34,7 @@ from warpflag_kernels.base import random_numbers
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body as body_stage
-from warpflag_kernels.fluid import lanczos as lanczos_stage
+from warpflag_kernels.fluid import lanczos_space
 from warpflag_kernels.fluid import noise as noise_stage
 
 CARRIED = ("force", "on_body", "velocity", "of_body")
@@ -68,12 +68,12 @@ def allocate(model: DeviceModel) -> Any:
 def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamespace:
     real, vec3, vec4, vec6 = p.real, p.vec3, p.vec4, wp.types.vector(6, p.real)
     Model, State, Drift = structs(p).Model, structs(p).State, struct(p)
-    Noise, Lanczos = noise_stage.struct(p), lanczos_stage.struct(p)
+    Noise, Lanczos = noise_stage.struct(p), lanczos_space.struct(p)
     f = noise_stage.functions(p, pairs)
     self_mobility, node_tangent, axial_root = f.self_mobility, f.node_tangent, f.axial_root
     shell_product = f.shell_product
     normals, respond = random_numbers.functions(p).normals, body_stage.mobility(p).respond
-    most, zero = wp.constant(lanczos_stage.MOST_PRODUCTS), wp.constant(real(0.0))
+    most, zero = wp.constant(lanczos_space.MOST_PRODUCTS), wp.constant(real(0.0))
     for_node, for_shift, for_turn = (
         wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
     )
