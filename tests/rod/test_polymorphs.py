@@ -181,7 +181,7 @@ def test_joints_go_on_to_the_second_form_from_the_root(device):
     assert (found == 2).sum() > 3
     # No further joint goes on once its interval is over, though the motor still winds up.
     ended = Simulation(scene, device=device)
-    second = ended.system.model.data.polymorphs.second
+    second = ended.system.model.optional.polymorphs.second
     intervals = np.zeros_like(second.numpy())
     intervals[0] = begin, begin + 5e-4
     second.assign(intervals)
