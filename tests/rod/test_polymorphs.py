@@ -232,7 +232,7 @@ def test_forms_of_the_mirrored_filament_are_mirror_images(device, precision):
     strains = []
     for own in ((0.3, 1.3, -2.1), (-0.3, 1.3, 2.1)):
         sim = Simulation(cell({**values, "flagella.intrinsic_curvature": own}, precision), device=device)
-        strains.append(sim.system.model.data.polymorphs.rest_strain.numpy()[3:-3].reshape(-1, 3, 3))
+        strains.append(sim.system.model.optional.polymorphs.rest_strain.numpy()[3:-3].reshape(-1, 3, 3))
     np.testing.assert_allclose(strains[0] * [-1.0, 1.0, -1.0], strains[1], rtol=1e-6)
     assert np.abs(strains[0][0, 0] - strains[0][0, 1]).min() > 0.01
     h = sim.scenes[0].resolved_flagella()[0].segment_length

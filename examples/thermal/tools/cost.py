@@ -39,7 +39,7 @@ def cost(share: float) -> None:
                         stack.enter_context(patch.object(equilibrium, "random_contacts", _quiet_contacts))
                         for step in ("add_forces", "add_velocities", "remember"):
                             stack.enter_context(patch.object(mean_drift, step, lambda *_: None))
-                        stack.enter_context(patch.object(sim.stepper, "_draw_flows", lambda **_: None))
+                        stack.enter_context(patch.object(sim.stepper, "draw_flows", lambda **_: None))
                     sim.prepare()
                     sim.advance(1e-5)
                     began = time.process_time()
