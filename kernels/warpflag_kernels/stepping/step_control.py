@@ -35,7 +35,7 @@ SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of w
 FADING_STEPS = 20.0  # over how many steps that mean fades
 FADING_TIME = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
 # Shortest steps in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in water as
-# long as MEMORY_SYSTEMATIC, in thinner fluids shorter.
+# long as FADING_TIME, in thinner fluids shorter.
 LOWERING = 25000.0
 LOWEST = 1.0e-2  # of that rate, over what was asked: steps are then a tenth as long
 FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of its memory
