@@ -17,6 +17,7 @@ from warpflag.run.check.polymorphs import of_polymorphs
 from warpflag.run.check.rigid import mesh_dependence, turning
 from warpflag.run.check.time_needed import Needed, needed
 from warpflag.run.simulation import Simulation
+from warpflag.scene.resistance import spheroid_mobility
 
 
 def lines(**values):
@@ -61,6 +62,11 @@ def test_sizes_of_what_is_left_out_are_those_of_theory():
     far = turning(small()).axial_length + 0.4
     mean = np.mean(1.5 * 0.4 / np.linspace(0.4, far, 10001))
     assert told(r"about (\d+) % of the swimming speed", **sphere) == pytest.approx(100 * mean, abs=1.0)
+    # Near the rear pole of a long body, whose drag is that of a sphere of another radius.
+    a = 1 / (6 * math.pi * 1e-3 * spheroid_mobility(2.5, 0.8, 1e-3).along)
+    mean = np.mean(1.5 * a / np.linspace(1.2, 1.2 + turning(small()).axial_length, 10001))
+    rear = {"body__length": 2.5, "body__width": 0.8, "flagella__anchor_offset": 1.2}
+    assert told(r"about (\d+) % of the swimming speed", **rear) == pytest.approx(100 * mean, abs=1.0)
 
 
 def test_noise_turns_a_filament_as_rotational_diffusion_does():
@@ -116,6 +122,11 @@ def test_a_stiff_helix_turns_as_resistive_force_theory_says(spin):
     expected = scene.motor.torque / (6.0 * (turn - mixed**2 / move)) / (2 * math.pi)
     assert found.rate == pytest.approx(expected, rel=0.03)
     assert found.axial_length == pytest.approx(6.0 * c, rel=0.01) and found.radius == pytest.approx(radius, rel=0.01)
+
+
+def test_a_stiff_helix_feels_its_own_flow_where_the_mode_has_it():
+    rate = {mode: turning(small({"hydrodynamics.mode": mode})).rate for mode in ("none", "between", "within", "all")}
+    assert rate["within"] == rate["all"] > 1.1 * rate["none"] and rate["between"] == rate["none"]
 
 
 @pytest.mark.parametrize("mode, length, torque", [("all", 3.0, 2.0), ("none", 4.0, 1.0)])

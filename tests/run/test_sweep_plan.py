@@ -6,6 +6,8 @@ import csv
 import json
 import math
 import re
+import signal
+import threading
 from itertools import combinations
 from pathlib import Path
 
@@ -265,6 +267,41 @@ def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
             ended += workers.finished()
         assert [outcome.status for outcome in ended[0][1]] == ["done", "stopped"]
         assert workers.reached == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("status", "number"), [("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)])
+def test_workers_end_as_the_sweep_does(status, number, monkeypatch):
+    """By the signal that makes their members say the same."""
+    made = []
+
+    class Running:
+        """A worker that runs a batch until it gets a signal."""
+
+        def __init__(self, device, starter):
+            self.device, self.reached, self.thread, self.process = device, 0.0, None, self
+            self.asked, self.ended, self.signals = threading.Event(), threading.Event(), []
+            made.append(self)
+
+        def ask(self, request):
+            self.asked.set()
+            self.ended.wait(30.0)
+            return {"outcomes": None}
+
+        def send_signal(self, number):
+            self.signals.append(number)
+            self.ended.set()
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(pool, "_Worker", Running)
+    with pool.Pool(["somewhere"], {}) as workers, Stop() as stop:
+        workers.start(small(), stop)
+        workers.submit(pool.Batch([0], [Path("0")], [small()]))
+        assert made[0].asked.wait(30.0)
+        workers.end(status)
+        ((_, outcomes),) = workers.finished()
+    assert made[0].signals == [number] and [outcome.status for outcome in outcomes] == [status]
 
 
 def test_means_are_of_the_repeats_that_are_done(tmp_path):
