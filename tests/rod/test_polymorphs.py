@@ -13,7 +13,7 @@ from warpflag.model import switching
 from warpflag.observables import power_balance
 from warpflag.record import Record
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import Scene, load, with_values
+from warpflag.scene import Scene, SceneError, load, with_values
 
 A = 3.5
 NORMAL, SEMICOILED = np.array([0.0, 1.3, -2.1]), np.array([0.0, 2.84, 2.29])
@@ -297,3 +297,13 @@ def test_off_there_is_none_of_it(device):
 def test_what_makes_no_polymorphs_is_refused(key):
     with pytest.raises(ValueError, match=key):
         cell({"polymorphs.enabled": True, key: 0})
+
+
+@pytest.mark.parametrize(
+    "key, value, limit", [("propagation_back", 0.5, "0.5, above that of polymorphs.propagation, 0.4"),
+                          ("nucleation_back", -1.2, "1.2, above that of polymorphs.nucleation, 1.1")]
+)  # fmt: skip
+def test_thresholds_between_which_a_joint_would_go_to_and_fro_are_refused(key, value, limit):
+    with pytest.raises(SceneError, match=f"polymorphs.{key} = .* moment of {limit}"):
+        with_values(Scene(name="a"), {"polymorphs.enabled": True, f"polymorphs.{key}": value})
+    with_values(Scene(name="a"), {f"polymorphs.{key}": value})  # says nothing where it is off

@@ -115,6 +115,7 @@ class Scene(Section, key=""):
             self._check_start,
             self._check_hook,
             self._check_helix,
+            self._check_forms,
             self._check_noise,
         ):
             with problems.gathered():
@@ -241,6 +242,20 @@ class Scene(Section, key=""):
     def _check_start(self) -> None:
         if self.start.record is None and self.start.frame != -1:
             raise SceneError("start.frame", self.start.frame, "needs start.record, which is absent")
+
+    def _check_forms(self) -> None:
+        """A joint must not flip back under the moment that it flips at, or it would go to and fro for ever."""
+        forms = self.polymorphs
+        if not forms.enabled:
+            return
+        for name, back, limit in (
+            ("propagation", forms.propagation_back, forms.propagation),
+            ("nucleation", -forms.nucleation_back, forms.nucleation),
+        ):
+            if back > limit:
+                key, value = f"polymorphs.{name}_back", getattr(forms, f"{name}_back")
+                problem = f"flips joints back below a moment of {back:g}, above that of polymorphs.{name}, {limit:g}"
+                raise SceneError(key, value, problem, [f"polymorphs.{name}"])
 
     def _check_flagella(self, problems: Problems) -> None:
         if self.flagellum and len(self.flagellum) != self.flagella.count:
