@@ -165,7 +165,7 @@ CONSTANTS = {
         "stepping.rkc", (0.1, 0.01, 0.03, 0.3, 1.0), EXPLICIT, (("stepper", "rkc"), ("accuracy", 5e-3))
     ),
     "rkc.NOISE": Constant(
-        "stepping.rkc", (20.0, 1.0, 5.0, 80.0), ("free", "contact"), (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE)
+        "stepping.rkc", (5.0, 1.0, 20.0, 80.0), ("free", "contact"), (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE)
     ),
     "implicit.FIRST_TOLERANCE": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(

@@ -39,7 +39,7 @@ EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last pla
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 RADIUS_MARGIN = 1.15
 FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
-# Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.01 to 0.8 of
+# Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.02 to 0.6 of
 # what the accuracy allows (docs/numerics.md).
 ESTIMATE_SHARE = 0.1
 NOISE = 5.0  # an estimate below this times its usual round-off is taken to be round-off
