@@ -270,7 +270,7 @@ def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
 
 
 @pytest.mark.parametrize(("status", "number"), [("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)])
-def test_workers_end_as_the_sweep_does(status, number, monkeypatch):
+def test_workers_end_as_the_sweep_does(status, number):
     """By the signal that makes their members say the same."""
     made = []
 
@@ -294,8 +294,7 @@ def test_workers_end_as_the_sweep_does(status, number, monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr(pool, "_Worker", Running)
-    with pool.Pool(["somewhere"], {}) as workers, Stop() as stop:
+    with pool.Pool(["somewhere"], {}, worker=Running) as workers, Stop() as stop:
         workers.start(small(), stop)
         workers.submit(pool.Batch([0], [Path("0")], [small()]))
         assert made[0].asked.wait(30.0)
