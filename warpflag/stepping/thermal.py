@@ -28,7 +28,7 @@ from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, r
 from warpflag_kernels.stepping import dense_output, evaluation_time, health, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
-from warpflag_kernels.thermal import additive_chart, closing, equilibrium, mean_drift, strain_gradients
+from warpflag_kernels.thermal import additive_chart, closing, end_strains, equilibrium, mean_drift, strain_gradients
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import thermal_energy
@@ -111,8 +111,9 @@ class ThermalStepper:
             quasi_newton.allocate(model, contacts, law)
             self.flow = step_flow.allocate(model)
             self.drift = mean_drift.allocate(model)
-            self.stiffness = hessian.allocate(model)
+            self.stiffness, self.strains = hessian.allocate(model), strain_gradients.allocate(model)
             self._solved, self._product = chain_chart.allocate(model), chain_chart.allocate(model)
+            self._linear = chain_chart.allocate(model)
             self._magnitude = wp.zeros(len(contacts.gap), dtype=p.real, device=device)
             self._no_share = wp.zeros(model.cell_count, dtype=wp.float64, device=device)
             linearised.allocate(model, system.state)
@@ -139,7 +140,7 @@ class ThermalStepper:
         equilibrium.begin_step(model, state, parts, explicit)
         if model.timed:
             evaluation_time.within_step(state, s.control, self._data.one, model.device)
-        reconstruction.reconstruct(model, state, s.chart)
+        reconstruction.go_back(model, state, s.chart)
         noise.draw_local(model, state, s.control, self.noise, drifting=explicit)
         if explicit:
             self.draw_flows(in_single=False)
@@ -147,7 +148,7 @@ class ThermalStepper:
             launch_right_hand_side(model, state)
         else:
             self._evaluate()
-            strain_gradients.stiffness_without_prestress(model, state, self.stiffness)
+            strain_gradients.stiffness_without_prestress(model, state, self.strains, self.stiffness)
             linearised.factorise(model, state, self.stiffness, parts.band)
             if self.motors is not None:
                 motor_solve.prepare(model, state, parts.band, self.motors)
@@ -157,6 +158,8 @@ class ThermalStepper:
             self._remember_drift()
         x = self._x if explicit else self._solve()
         additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
+        if not explicit:
+            end_strains.owe_tensions(model, state, self.strains, s.control.step, self._work)
         listed = parts.contacts if self._touching else None
         health.check(model, state, s.chart, s.guard, s.control, listed)
         equilibrium.decide(model, state, parts, explicit)
@@ -217,7 +220,8 @@ class ThermalStepper:
         for term in self._smooth_terms:
             if term.launch is not None:
                 term.launch(model, state)
-        strain_gradients.add_random_moments(model, state, self.noise, s.control.steps, share)
+        strain_gradients.find(model, state, self.strains)
+        strain_gradients.add_random_moments(model, state, self.strains, self.noise, s.control.steps, share)
         forces.total_forces(model, state, self._smooth_terms)
         if self._touching:
             equilibrium.random_contacts(model, state, parts, self.noise, share, self._magnitude)
@@ -252,10 +256,12 @@ class ThermalStepper:
             self._solve_motors(found)
         if self._flows:
             self._solve_in_full(found, self.stability)
-            if self._touching:
-                self._close(found)
-            if self.motors is not None:
-                self._solve_motors(found)
+        room = self._linear, self._product
+        end_strains.correct(model, state, self._system.chart, self.strains, parts.band, self._work, room, found)
+        if self._flows and self._touching:
+            self._close(found)
+        if self.motors is not None:
+            self._solve_motors(found)
         if self.motors is not None:
             motor_solve.average_rates(model, state, parts.band, self.motors, found)
         return found

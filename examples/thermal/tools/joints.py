@@ -26,7 +26,7 @@ HOOKED = {"hook.length": 0.055, "hook.stiffness": 0.65}
 UNBENT = {"hook.length": 0.055, "hook.stiffness": 4.0, "flagella.opening_angle": 110.0, "flagella.on_axis": True}
 # Cell, values, step, cells, start, interval of the looks [s], number of looks. Cells without a stiff hook start in
 # equilibrium, joint by joint; the stepper's own takes the place of that within the time to the start.
-LONG = (96, 2e-4, 1e-4, 50)
+LONG = ((1e-6, 96, 2e-4, 1e-4, 50), (1e-5, 192, 5e-4, 1e-4, 150))
 CASES: list[tuple[str, dict[str, Any], float, int, float, float, int]] = [
     *(("free, 1.2 µm", {**FREE, **SHORT}, step, 300, 20 * step, 2 * step, 300) for step in (1e-6, 1e-5)),
     *(("two on a body, 1.2 µm", {**TWO, **SHORT}, step, 200, 20 * step, 2 * step, 300) for step in (1e-6, 1e-5)),
@@ -36,9 +36,11 @@ CASES: list[tuple[str, dict[str, Any], float, int, float, float, int]] = [
     ),
     ("two with hooks, flow round the body, 1.2 µm", {**TWO, **SHORT, **FLOW, **UNBENT}, 1e-5, 100, 1e-3, 2e-5, 300),
     ("two, motors locked, 1.2 µm", {**TWO, **SHORT, **LOCKED}, 1e-6, 200, 2e-5, 2e-6, 300),
-    *(("free, 6 µm", FREE, step, *LONG) for step in (1e-6, 1e-5)),
-    *(("two on a body, 6 µm", TWO, step, *LONG) for step in (1e-6, 1e-5)),
-    *(("two 0.05 µm apart, 6 µm", BUNDLED, step, *LONG) for step in (1e-6, 1e-5)),
+    *(("free, 6 µm", FREE, *run) for run in LONG),
+    *(("two on a body, 6 µm", TWO, *run) for run in LONG),
+    *(("two 0.05 µm apart, 6 µm", BUNDLED, *run) for run in LONG),
+    ("free and straight, 1.2 µm", {**FREE, **SHORT, **STRAIGHT}, 1e-5, 300, 2e-4, 2e-5, 300),
+    ("free and straight, 6 µm", {**FREE, **STRAIGHT}, *LONG[1]),
 ]
 
 

@@ -9,7 +9,8 @@ import warp as wp
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import comoving_chart as chart_stage
-from warpflag_kernels.rod import rotations
+from warpflag_kernels.rod import free_end, rotations
+from warpflag_kernels.rod.comoving_chart import vec6d
 
 
 @functools.cache
@@ -159,7 +160,27 @@ def _kernels(p: Precision) -> SimpleNamespace:
                 e += 1
             k += 1
 
-    return SimpleNamespace(bodies=bodies, roots=roots, nodes=nodes, frames_between=frames_between, cells=cells)
+    @wp.kernel(module=p.module("rewind"))
+    def rewind(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        chart: Chart,
+    ):
+        """Increments of the chart vanish."""
+        e = wp.tid()
+        c = model.cell_of[e]
+        if state.active[c] == 0:
+            return
+        chart.increment[e] = p.vec4(p.real(0.0))
+        if e == model.first_node[model.first_flagellum[c]]:
+            chart.body_increment[c] = vec6d(wp.float64(0.0))
+
+    return SimpleNamespace(
+        bodies=bodies, roots=roots, nodes=nodes, frames_between=frames_between, cells=cells, rewind=rewind
+    )
 
 
 def reconstruct(model: DeviceModel, state: DeviceState, chart: Any) -> None:
@@ -173,3 +194,12 @@ def reconstruct(model: DeviceModel, state: DeviceState, chart: Any) -> None:
     wp.launch(kernels.roots, model.flagellum_count, inputs=inputs, device=model.device)
     wp.launch(kernels.nodes, model.element_count, inputs=inputs, device=model.device)
     wp.launch(kernels.frames_between, model.element_count, inputs=inputs, device=model.device)
+
+
+def go_back(model: DeviceModel, state: DeviceState, chart: Any) -> None:
+    """The pose of the start of the step, into the pose of `state`; the increments of the chart vanish."""
+    kernel = _kernels(model.precision).rewind
+    wp.launch(kernel, model.element_count, inputs=[model.data, state.data, chart], device=model.device)
+    reconstruct(model, state, chart)
+    if model.switches.has("free end"):
+        free_end.align_axes(model, state)

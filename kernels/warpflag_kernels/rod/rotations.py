@@ -138,6 +138,7 @@ def functions(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(
         transport=transport,
         transport_spin=transport_spin,
+        sine_cosine=sine_cosine,
         angle=angle,
         turn=turn,
         perpendicular_unit=perpendicular_unit,

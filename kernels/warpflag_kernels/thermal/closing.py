@@ -80,24 +80,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
             i += 1
 
     @wp.kernel(module=module)
-    def rewind(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        chart: Chart,
-    ):
-        """Increments of the chart vanish."""
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        chart.increment[e] = p.vec4(real(0.0))
-        if e == model.first_node[model.first_flagellum[c]]:
-            chart.body_increment[c] = vec6d(wp.float64(0.0))
-
-    @wp.kernel(module=module)
     def look(
         # Out:
         stability: Stability,
@@ -144,7 +126,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if e == model.first_node[model.first_flagellum[c]]:
             out.body[c] = out.body[c] + x.body[c]
 
-    return SimpleNamespace(mark=mark, take_back=take_back, rewind=rewind, look=look, difference=set_difference, add=add)
+    return SimpleNamespace(mark=mark, take_back=take_back, look=look, difference=set_difference, add=add)
 
 
 def mark(model: DeviceModel, state: DeviceState, contacts: Any, law: Any, stability: Any, anew: bool) -> None:
@@ -160,8 +142,7 @@ def renew(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: Any,
     kernels, device = _kernels(model.precision), model.device
     additive_chart.retract(model, state, chart, x, work)
     search.renew(model, state, state.data.pose, contacts)
-    wp.launch(kernels.rewind, model.element_count, inputs=[model.data, state.data, chart], device=device)
-    reconstruction.reconstruct(model, state, chart)
+    reconstruction.go_back(model, state, chart)
     inputs = [model.data, state.data, x, contacts, law]
     wp.launch(kernels.take_back, model.cell_count, inputs=inputs, device=device)
 

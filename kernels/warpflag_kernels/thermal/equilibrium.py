@@ -25,7 +25,6 @@ from warpflag_kernels.fluid import noise as noise_stage
 from warpflag_kernels.implicit import block_band, delassus
 from warpflag_kernels.rod import chain_chart
 from warpflag_kernels.rod import comoving_chart as chart_stage
-from warpflag_kernels.rod.comoving_chart import vec6d
 from warpflag_kernels.stepping.health import Fault, encode
 
 IMPLICITNESS = 1.0  # implicitness: 1 damps what is driven, 1/2 would leave stiff modes ringing for ever
@@ -67,7 +66,6 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
         count = wp.max(wp.ceil(left / control.longest_step[c] - tolerance), wp.float64(1.0))
         control.step[c] = left / count
         chart.elapsed[c] = wp.float64(0.0)
-        chart.body_increment[c] = vec6d(wp.float64(0.0))
         chart.at_start[c] = 0
         if wp.static(not explicit):
             band.step[c] = control.step[c]
@@ -77,19 +75,6 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
             law.gain[c] = theta
             law.failed[c] = 0
             law.gap_tolerance[c] = gap_tolerance * model.steric.diameter[c]
-
-    @wp.kernel(module=module)
-    def clear(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        # Out:
-        chart: Chart,
-    ):
-        e = wp.tid()
-        if state.active[model.cell_of[e]] != 0:
-            chart.increment[e] = vec4(real(0.0))
 
     @wp.kernel(module=module)
     def right_hand_side(
@@ -169,7 +154,7 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
             state.active[c] = 0
             wp.atomic_sub(control.unfinished, 0, 1)
 
-    return SimpleNamespace(begin=begin, clear=clear, right_hand_side=right_hand_side, decide=decide, finish=finish)
+    return SimpleNamespace(begin=begin, right_hand_side=right_hand_side, decide=decide, finish=finish)
 
 
 @functools.cache
@@ -210,7 +195,7 @@ def _contact_kernel(p: Precision) -> Any:
 
 
 def begin_step(model: DeviceModel, state: DeviceState, s: Any, explicit: bool) -> None:
-    """The next step of every cell and its coefficients; the increments of the chart vanish.
+    """The next step of every cell and its coefficients.
 
     Args:
         model, state: of the batch.
@@ -220,7 +205,6 @@ def begin_step(model: DeviceModel, state: DeviceState, s: Any, explicit: bool) -
     kernels, device = _kernels(model.precision, explicit), model.device
     inputs = [model.data, state.data, s.control, s.chart, s.band, s.contacts, s.law]
     wp.launch(kernels.begin, model.cell_count, inputs=inputs, device=device)
-    wp.launch(kernels.clear, model.element_count, inputs=[model.data, state.data, s.chart], device=device)
 
 
 def right_hand_side(model: DeviceModel, state: DeviceState, s: Any, noise: Any, x: Any, explicit: bool) -> None:

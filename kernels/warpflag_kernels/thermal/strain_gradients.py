@@ -28,12 +28,38 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import noise as noise_stage
 from warpflag_kernels.motor import hook
-from warpflag_kernels.rod import hessian
+from warpflag_kernels.rod import hessian, rotations
+
+
+@functools.cache
+def struct(p: Precision) -> Any:
+    """The struct `Strains`: strains of the joints at the start of a step, and their gradients. Per element [E]."""
+    vec3, mat33 = p.vec3, p.mat33
+
+    @wp.struct
+    class Strains:
+        value: wp.array(dtype=vec3)  # [rad]
+        by_first: wp.array(dtype=mat33)  # rows: of the strains, over the first segment's vector [1/um], the tripod's unit
+        by_second: wp.array(dtype=mat33)  # the same of the second segment's [1/um]
+        by_first_spin: wp.array(dtype=vec3)
+        by_second_spin: wp.array(dtype=vec3)
+
+    return Strains
+
+
+def allocate(model: DeviceModel) -> Any:
+    """Arrays of the struct `Strains`, zero."""
+    p, s = model.precision, struct(model.precision)()
+    for name in ("by_first", "by_second"):
+        setattr(s, name, wp.zeros(model.element_count, dtype=p.mat33, device=model.device))
+    for name in ("value", "by_first_spin", "by_second_spin"):
+        setattr(s, name, wp.zeros(model.element_count, dtype=p.vec3, device=model.device))
+    return s
 
 
 @functools.cache
 def functions(p: Precision) -> SimpleNamespace:
-    """Device functions: gradients of the strains of a joint, and their stiffness."""
+    """Device functions: gradients of the strains of a joint, their stiffness, and whether there is a joint."""
     real, vec3 = p.real, p.vec3
     Model, Pose = structs(p).Model, structs(p).Pose
     half, zero, one, two = (wp.constant(real(x)) for x in (0.5, 0.0, 1.0, 2.0))
@@ -91,23 +117,47 @@ def functions(p: Precision) -> SimpleNamespace:
         bend = model.rod.bending_rigidity[k] * per_length
         return vec3(bend, bend, model.rod.twist_rigidity[k] * per_length)
 
-    return SimpleNamespace(joint_gradients=joint_gradients, joint_stiffness=joint_stiffness)
+    @wp.func(module=module)
+    def joined(model: Model, i: wp.int32, k: wp.int32):
+        """Whether something joins segment i and the next: not at the tripod of a free filament, nor at the last."""
+        if i == model.first_node[k] and model.rod.hook_rigidity[k] == zero:
+            return False
+        return i + 1 < model.first_node[k + 1]
+
+    return SimpleNamespace(joint_gradients=joint_gradients, joint_stiffness=joint_stiffness, joined=joined)
 
 
 @functools.cache
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
-    Stiffness, Noise = hessian.struct(p), noise_stage.struct(p)
+    Stiffness, Noise, Strains = hessian.struct(p), noise_stage.struct(p), struct(p)
     f = functions(p)
-    joint_gradients, joint_stiffness = f.joint_gradients, f.joint_stiffness
+    joint_gradients, joint_stiffness, joined = f.joint_gradients, f.joint_stiffness, f.joined
+    joint_strain = rotations.functions(p).joint_strain
     normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.STRAIN)
     module = p.module("strain_noise")
 
-    @wp.func(module=module)
-    def without_joint(model: Model, i: wp.int32, k: wp.int32):
-        """Whether there is nothing to join segment i and the next: at the tripod of a free filament."""
-        return i == model.first_node[k] and model.rod.hook_rigidity[k] == real(0.0)
+    @wp.kernel(module=module)
+    def find(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        # Out:
+        strains: Strains,
+    ):
+        i = wp.tid()
+        k = model.flagellum_of[i]
+        if state.active[model.cell_of[i]] == 0 or not joined(model, i, k):
+            return
+        on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
+        pose = state.pose
+        strains.value[i] = joint_strain(pose.tangent[i], pose.tangent[i + 1], pose.director[i], pose.director[i + 1])
+        strains.by_first[i] = on_e
+        strains.by_second[i] = on_f
+        strains.by_first_spin[i] = spin_e
+        strains.by_second_spin[i] = spin_f
 
     @wp.kernel(module=module)
     def stiffnesses(
@@ -115,6 +165,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         model: Model,
         # State:
         state: State,
+        strains: Strains,
         # Out:
         stiffness: Stiffness,
     ):
@@ -126,9 +177,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
             t = state.pose.tangent[i]
             per_length = model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
             stiffness.stretch[i] = per_length * wp.outer(t, t)
-        if i + 1 == model.first_node[k + 1] or without_joint(model, i, k):
+        if not joined(model, i, k):
             return
-        on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
+        on_e = strains.by_first[i]
+        on_f = strains.by_second[i]
+        spin_e = strains.by_first_spin[i]
+        spin_f = strains.by_second_spin[i]
         s = joint_stiffness(model, i, k)
         loaded_e = wp.diag(s) * on_e
         loaded_f = wp.diag(s) * on_f
@@ -149,6 +203,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Model:
         model: Model,
         # State:
+        strains: Strains,
         noise: Noise,
         steps: wp.array(dtype=wp.int32),
         share: real,
@@ -162,17 +217,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
             return
         k = model.flagellum_of[i]
         last = model.first_node[k + 1] - 1
-        if i == last or without_joint(model, i, k):
+        if not joined(model, i, k):
             return
         own = i - model.first_node[model.first_flagellum[c]]
         xi = normals(noise.seed[c], own, steps[c], for_strain)
         scale = share * real(wp.sqrt(noise.energy[c]))
-        on_e, on_f, spin_e, spin_f = joint_gradients(model, state.pose, i, k)
         s = joint_stiffness(model, i, k)
         m = scale * vec3(wp.sqrt(s[0]) * xi[0], wp.sqrt(s[1]) * xi[1], wp.sqrt(s[2]) * xi[2])
         tension = scale * wp.sqrt(model.rod.stretching_stiffness[k] / model.rod.segment_length[k])
-        before = wp.transpose(on_e) * m
-        after = wp.transpose(on_f) * m
+        before = wp.transpose(strains.by_first[i]) * m
+        after = wp.transpose(strains.by_second[i]) * m
         if i > model.first_node[k]:
             before += tension * xi[3] * state.pose.tangent[i]
         if i + 1 == last:  # no joint begins with the last segment
@@ -180,10 +234,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
             after += tension * xi[3] * state.pose.tangent[last]
         state.joint_before[i] = state.joint_before[i] + before
         state.joint_after[i] = state.joint_after[i] + after
-        state.joint_spin_before[i] = state.joint_spin_before[i] + wp.dot(m, spin_e)
-        state.joint_spin_after[i] = state.joint_spin_after[i] + wp.dot(m, spin_f)
+        state.joint_spin_before[i] = state.joint_spin_before[i] + wp.dot(m, strains.by_first_spin[i])
+        state.joint_spin_after[i] = state.joint_spin_after[i] + wp.dot(m, strains.by_second_spin[i])
 
-    return SimpleNamespace(stiffnesses=stiffnesses, random_moments=random_moments)
+    return SimpleNamespace(find=find, stiffnesses=stiffnesses, random_moments=random_moments)
 
 
 @functools.cache
@@ -253,26 +307,41 @@ def _hook_kernels(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(add_stiffness=add_stiffness, add_random_moment=add_random_moment)
 
 
-def stiffness_without_prestress(model: DeviceModel, state: DeviceState, stiffness: Any) -> None:
-    """J^T k J joint by joint and segment by segment, into `stiffness`, in place of the second derivatives."""
-    inputs, device = [model.data, state.data, stiffness], model.device
+def find(model: DeviceModel, state: DeviceState, strains: Any) -> None:
+    """Strains of the joints of the pose and their gradients, into the struct `Strains`."""
+    inputs = [model.data, state.data, strains]
+    wp.launch(_kernels(model.precision).find, model.element_count, inputs=inputs, device=model.device)
+
+
+def stiffness_without_prestress(model: DeviceModel, state: DeviceState, strains: Any, stiffness: Any) -> None:
+    """J^T k J joint by joint and segment by segment, into `stiffness`, in place of the second derivatives.
+
+    Args:
+        model, state: of the batch.
+        strains: struct `Strains`, with J at this pose.
+        stiffness: struct `Stiffness`.
+    """
+    inputs, device = [model.data, state.data, strains, stiffness], model.device
     wp.launch(_kernels(model.precision).stiffnesses, model.element_count, inputs=inputs, device=device)
     if model.switches.has("hook"):
-        kernel = _hook_kernels(model.precision).add_stiffness
+        kernel, inputs = _hook_kernels(model.precision).add_stiffness, [model.data, state.data, stiffness]
         wp.launch(kernel, model.flagellum_count, inputs=inputs, device=device)
 
 
-def add_random_moments(model: DeviceModel, state: DeviceState, noise: Any, steps: Any, share: float) -> None:
+def add_random_moments(
+    model: DeviceModel, state: DeviceState, strains: Any, noise: Any, steps: Any, share: float
+) -> None:
     """Adds the random elastic force to the joints' energy gradients, which have been evaluated.
 
     Args:
         model, state: of the batch.
+        strains: struct `Strains`, with J at this pose.
         noise: struct `Noise`.
         steps: number of the step that begins, shape [cell_count].
         share: factor on the force.
     """
-    inputs, device = [model.data, noise, steps, share, state.data], model.device
+    inputs, device = [model.data, strains, noise, steps, share, state.data], model.device
     wp.launch(_kernels(model.precision).random_moments, model.element_count, inputs=inputs, device=device)
     if model.switches.has("hook"):
-        kernel = _hook_kernels(model.precision).add_random_moment
+        kernel, inputs = _hook_kernels(model.precision).add_random_moment, [model.data, noise, steps, share, state.data]
         wp.launch(kernel, model.flagellum_count, inputs=inputs, device=device)
