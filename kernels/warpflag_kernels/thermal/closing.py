@@ -21,8 +21,6 @@ from warpflag_kernels.contact import contact_list, search
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.implicit import stability as stability_stage
 from warpflag_kernels.rod import chain_chart, reconstruction
-from warpflag_kernels.rod import comoving_chart as chart_stage
-from warpflag_kernels.rod.comoving_chart import vec6d
 from warpflag_kernels.thermal import additive_chart
 
 
@@ -31,7 +29,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     real = p.real
     Model, State, Stability = structs(p).Model, structs(p).State, stability_stage.struct(p)
     Contacts, Law, Increment = contact_list.struct(p), delassus.struct(p), chain_chart.types(p).Increment
-    gap_change, Chart = contact_list.functions(p).gap_change, chart_stage.struct(p)
+    gap_change = contact_list.functions(p).gap_change
     module = p.module("closing")
 
     @wp.kernel(module=module)

@@ -39,8 +39,8 @@ def struct(p: Precision) -> Any:
     @wp.struct
     class Strains:
         value: wp.array(dtype=vec3)  # [rad]
-        by_first: wp.array(dtype=mat33)  # rows: of the strains, over the first segment's vector [1/um], the tripod's unit
-        by_second: wp.array(dtype=mat33)  # the same of the second segment's [1/um]
+        by_first: wp.array(dtype=mat33)  # rows: strains over the first vector [1/um], the tripod's unit one
+        by_second: wp.array(dtype=mat33)  # over the second segment's vector [1/um]
         by_first_spin: wp.array(dtype=vec3)
         by_second_spin: wp.array(dtype=vec3)
 
