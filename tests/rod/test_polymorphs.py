@@ -12,6 +12,7 @@ from tests.runs import executed
 from warpflag.model import switching
 from warpflag.observables import power_balance
 from warpflag.record import Record
+from warpflag.record.recorder import Recorder
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.scene import Scene, SceneError, load, with_values
 
@@ -89,6 +90,18 @@ def test_a_front_stops_where_the_moment_has_fallen_to_the_threshold_if_the_forms
         found = grown(-torque, device, 2e-2, **COLLINEAR, **{"hydrodynamics.mode": "consistent"})
         assert abs(found.mean() - (1.0 - 0.4 / torque)) < 0.05
         assert np.abs(np.diff(found)).sum() == 1
+
+
+def test_a_scene_that_starts_from_a_record_has_the_forms_of_its_frame(tmp_path, device):
+    scene = cell({**HELD, "motor.torque": -3.4, "duration": 4e-3, "frames": 2})
+    Simulation(scene, device=device, reporters=[Recorder(tmp_path / "run.h5")]).run()
+    with Record(tmp_path / "run.h5") as record:
+        kept = record.frame(-1).forms[1:-1]
+    assert 0.2 < kept.mean() < 0.9
+    sim = Simulation(with_values(scene, {"start.record": str(tmp_path / "run.h5")}), device=device)
+    np.testing.assert_array_equal(forms(sim), kept)
+    sim.advance(1e-4)
+    assert abs(forms(sim).sum() - kept.sum()) <= 2  # the front is where it was
 
 
 REAL_HOOK = {"hook.stiffness": 0.65, "hydrodynamics.mode": "consistent", "polymorphs.ramp": 1e-3}

@@ -169,6 +169,17 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     return chart
 
 
+def begin_forms(model: DeviceModel, state: DeviceState, starts: Sequence[InitialState]) -> None:
+    """Forms of polymorphs as the starts have them, their ramps over; nothing where there are none."""
+    if model.switches.has("polymorphs") and any(start.forms is not None for start in starts):
+        joined = []
+        for start in starts:
+            count = sum(map(len, start.positions))
+            joined.append(np.zeros(count, np.int32) if start.forms is None else start.forms.astype(np.int32))
+        state.optional.forms.form.assign(np.concatenate(joined))
+        state.optional.forms.before.assign(state.optional.forms.form)
+
+
 def build_control(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
     """The struct `Control`: the clocks of every cell, at the times of their starts."""
     control = clock.allocate(model.cell_count, model.device)

@@ -45,7 +45,8 @@ class InitialState:
     positions: nodes r_0..r_N per flagellum, lab [um], shape [N + 1, 3]. directors: e1 of the motor tripod and
     of segments 1..N, shape [N + 1, 3]. body_position [um], shape [3]; body_orientation, quaternion
     (x, y, z, w) from body axes to lab axes, shape [4]; time [s]. notes: what was changed of a scene's own shape to
-    begin clear of body and other flagella, a line each.
+    begin clear of body and other flagella, a line each. forms: of polymorphs at every node, shape [node]; absent: that
+    of the ground state.
     """
 
     positions: tuple[Array, ...]
@@ -54,6 +55,7 @@ class InitialState:
     body_orientation: Array
     time: float = 0.0
     notes: tuple[str, ...] = ()
+    forms: NDArray[np.integer] | None = None
 
 
 def initial_state(scene: Scene) -> InitialState:

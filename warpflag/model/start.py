@@ -55,6 +55,7 @@ def shape_of_frame(frame: Frame, first_node: np.ndarray) -> InitialState:
         directors=tuple(np.split(frame.directors, first_node[1:-1])),
         body_position=frame.body_position,
         body_orientation=frame.body_orientation,
+        forms=frame.forms,
     )
 
 

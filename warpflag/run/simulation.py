@@ -19,7 +19,7 @@ from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 from warpflag.base.device import LAUNCHING, alone, find_device
 from warpflag.base.kernels import load_kernels
 from warpflag.base.progress import watching
-from warpflag.model.build import build_chart, build_control, build_model, build_state, plan_of
+from warpflag.model.build import begin_forms, build_chart, build_control, build_model, build_state, plan_of
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import check_outside
 from warpflag.model.starts import starting_states
@@ -80,6 +80,7 @@ class Simulation:
         self.device = model.device
         state = build_state(model)
         chart = build_chart(model, starts)
+        begin_forms(model, state, starts)
         self.system = System(model, state, chart, build_control(model, starts), health.allocate(model, chart))
         self.stepper = make_stepper(self.system, self.scenes)
         self.first_node = model.data.first_node.numpy()
