@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 __all__ = ["OptionError", "add", "sweep"]
 
 
+_LEAST_JOB_SECONDS = 60.0  # Slurm counts minutes, and a worker takes seconds to begin
+
+
 class OptionError(ValueError):
     """Options that do not go together; one line."""
 
@@ -91,9 +94,10 @@ def sweep(options: argparse.Namespace) -> Outcome | str:
 
     limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}
     with Stop(options.max_wall) as stop, _early_starter(options) as starter:
-        started = _started(options)
-        if options.slurm or options.slurm_script:
-            return _submitted(started, options)
+        seconds = _job_seconds(options)
+        started = _started(options, starter)
+        if seconds is not None:
+            return _submitted(started, options, seconds)
         limits |= {"movies": options.movies, "share": options.share}
         return started.execute(options.workers, options.device, options.quiet, stop, starter=starter, **limits)
 
@@ -108,23 +112,44 @@ def _early_starter(options: argparse.Namespace) -> contextlib.AbstractContextMan
     return contextlib.closing(Starter("warpflag.run.sweep.worker"))
 
 
-def _started(options: argparse.Namespace) -> SweepRun:
+def _started(options: argparse.Namespace, starter: Starter | None) -> SweepRun:
+    from warpflag.run.sweep import plan  # without Warp: the workers begin to load kernels while this process imports it
+
+    read = None if options.scene is None else plan.read(options.scene, options.set, options.grid)
+    if starter is not None and read is not None and (scene := read.first_scene()) is not None:
+        from warpflag.scene import dumps
+
+        with contextlib.suppress(OSError):  # which `execute` finds as well
+            starter.begin({"scene": dumps(scene), "quiet": options.quiet})
+    if options.device and not (options.slurm or options.slurm_script):
+        from warpflag.base.device import find_device
+
+        find_device(options.device)
     from warpflag.run import sweep
 
-    if options.scene is None:
+    if read is None:
         return sweep.resume(options.resume)
-    plan = sweep.read(options.scene, options.set, options.grid)
-    return (sweep.resume_or_start if options.resume_or_start else sweep.start)(plan, options.output)
+    return (sweep.resume_or_start if options.resume_or_start else sweep.start)(read, options.output)
 
 
-def _submitted(started: SweepRun, options: argparse.Namespace) -> str:
+def _job_seconds(options: argparse.Namespace) -> float | None:
+    """Wall time of a job on a cluster [s]; None where the sweep runs on this machine."""
     from warpflag.run.stop import wall_seconds
-    from warpflag.run.sweep import slurm
 
+    if not (options.slurm or options.slurm_script):
+        return None
     try:
         seconds = wall_seconds(options.time or "1:00:00")
     except ValueError as error:
         raise OptionError(f"--time: {error}") from None
+    if seconds < _LEAST_JOB_SECONDS:
+        raise OptionError(f"--time {options.time}: a job needs a minute at least")
+    return seconds
+
+
+def _submitted(started: SweepRun, options: argparse.Namespace, seconds: float) -> str:
+    from warpflag.run.sweep import slurm
+
     further = dict(pair.partition("=")[::2] for pair in options.slurm_set)
     jobs = slurm.Jobs(started, seconds, options.jobs, options.workers, options.device, options.movies, further)
     return jobs.script() if options.slurm_script else jobs.submit()

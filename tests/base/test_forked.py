@@ -70,6 +70,15 @@ def test_processes_share_what_was_prepared_once_and_end_by_themselves(starter):
     assert third.wait() == 0 and soon(third.stdout.read) == ""
 
 
+def test_what_it_has_begun_to_prepare_is_not_prepared_again(starter):
+    starter.begin("early")
+    starter.prepare("late")
+    process = starter.fork()
+    assert "early" in (said := ask(process, "here")) and "late" not in said
+    starter.prepare("later")
+    assert "later" in ask(starter.fork(), "here")
+
+
 def test_a_process_outlives_its_starter_and_the_starter_no_signal_but_its_end(starter):
     process = starter.fork()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

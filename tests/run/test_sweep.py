@@ -21,7 +21,6 @@ from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
 from warpflag.run.sweep import Sweep
-from warpflag.run.sweep.pool import best_size
 from warpflag.scene import dumps
 
 BASE = {"duration": 4e-5, "frames": 4, "flagella.length": 1.0}
@@ -83,21 +82,6 @@ def test_means_and_standard_errors_are_those_of_the_repeats(tmp_path):
             "0",
         )  # none zips
         assert "flagellum.0.torque" not in mean  # it differs from repeat to repeat
-
-
-def test_the_size_of_batches_follows_what_was_measured():
-    assert best_size(8, 2, alone=0.3, together=0.4, sample=8, largest=64)[0] == 1  # a batch is dearer
-    assert best_size(8, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 8  # one worker takes all
-    assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
-    assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
-    assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
-    # A member takes 0.1 s of its own, and a batch 0.2 s once: alone 0.3, in a batch of 8 0.125 s.
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=64)
-    assert (size, seconds) == pytest.approx((64, 64 * 0.1 + 0.2))
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=16)
-    assert (size, seconds) == pytest.approx((16, 64 * 0.1 + 4 * 0.2))
-    size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
-    assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
 
 
 def test_what_is_done_is_not_run_again(tmp_path):
@@ -185,6 +169,37 @@ def test_a_member_of_another_scene_is_refused(tmp_path):
     (tmp_path / "out" / "0001" / "scene.toml").write_text(dumps(small({"motor.torque": 1.5})))
     with pytest.raises(RunError, match="another scene"):
         started.execute(workers=1, quiet=True)
+
+
+def test_a_finished_member_of_another_scene_is_refused(tmp_path):
+    """A value put in front of an axis would give every row of the table the numbers of its neighbour."""
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    table, file = (tmp_path / "out" / "table.csv").read_bytes(), tmp_path / "out" / "sweep.toml"
+    text = file.read_text()
+    file.write_text(text.replace("[1.0,", "[0.5, 1.0,"))
+    with pytest.raises(RunError, match=r"0000: holds the run of another scene: motor.torque = 0.5"):
+        sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
+    assert (tmp_path / "out" / "table.csv").read_bytes() == table
+    file.write_text(text.replace("3.0]", "3.0, 3.4]"))  # one more at the end is a longer sweep
+    assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
+    assert [row["motor.torque"] for row in rows(tmp_path / "out")] == ["1.0", "2.0", "3.0", "3.4"]
+
+
+def test_an_odd_summary_does_not_end_the_table(tmp_path):
+    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+    started.execute(workers=1, quiet=True)
+    odd = '{"status": "done", "time": "x", "rates": 3, "observables": [1, "a", null]}'
+    (tmp_path / "out" / "0001" / "summary.json").write_text(odd)
+    assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
+    assert [row["status"] for row in rows(tmp_path / "out")] == ["done"] * 3
+
+
+@pytest.mark.parametrize("options", [{"share": (2, 2)}, {"share": (0, 0)}, {"share": (-1, 2)}, {"workers": 0}])
+def test_shares_and_workers_that_there_are_not(tmp_path, options):
+    started = sweep.start(Sweep(small(BASE), {"motor.torque": TORQUES}), str(tmp_path / "out"))
+    with pytest.raises(ValueError, match="must be"):
+        started.execute(quiet=True, **options)
 
 
 def test_shares_complete_each_other(tmp_path):

@@ -1,4 +1,4 @@
-"""What a sweep file makes: its members, what is random in them, and what is refused."""
+"""What a sweep file makes: its members, what is random in them, what is refused, and which advance together."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ import pytest
 from tests.runs import small
 from warpflag.model.geometry import initial_state
 from warpflag.run.stop import Stop
-from warpflag.run.sweep import BadMembers, Sweep, grid_axes, pool, read, start, table
+from warpflag.run.sweep import BadMembers, Sweep, batches, grid_axes, pool, read, resume, start, table
+from warpflag.run.sweep.pool import Pool
 from warpflag.scene import SceneError, dumps, load, with_values
 
 
@@ -165,6 +166,8 @@ def test_even_and_given_anchors(folder):
         ("repeats = 0\n", ["repeats", "1 to"]),
         ("repeats = 2\n[axes]\nmotor.torque = [1.0]\n", ["repeats", "again and again"]),
         ("[axes]\nmotor.torque = []\n", ["motor.torque", "list of values"]),
+        ("[axes]\nmotor.torque = [1, 2.0, 1.0]\n", ["motor.torque", "1.0 twice"]),
+        ('[axes]\nname = ["a", "b"]\n', ["axes.name", "numbers"]),
         ("[axes]\nmotor.torque = {from = 1, to = 2}\n", ["motor.torque", "count"]),
         ("[axes]\nmotor.torque = {from = 1, to = inf, count = 3}\n", ["motor.torque"]),
         ("[axes]\nmotor.torque = {from = 1, to = 2, count = 1.5}\n", ["motor.torque.count"]),
@@ -173,6 +176,14 @@ def test_even_and_given_anchors(folder):
         ("[random]\nmotor.torque = {low = 3, high = 2}\n", ["random.motor.torque", "low"]),
         ("[random]\nmotor.torque = {low = 3, hgh = 2}\n", ["random.motor.torque", "high"]),
         ("[random]\nmotor.torque = {mean = 3, deviation = -1}\n", ["deviation"]),
+        (
+            "[axes]\nmotor.torque = [1, 2]\n[random]\nmotor.torque = {low = 1, high = 2}\n",
+            ["axes.motor.torque", "drawn"],
+        ),
+        (
+            "[axes]\nflagellum.1.torque = [1, 2]\n[random]\nflagellum.torque = {low = 1, high = 2}\n",
+            ["axes.flagellum.1.torque", "and 1 more", "drawn"],
+        ),
         ("[random]\nanchors = {placement = 'anywhere'}\n", ["random.anchors.placement", "even, given, random"]),
         ("[random]\nanchors = {placement = 'random', distance = 1}\n", ["random.anchors", "least_distance"]),
         ("[random]\nanchors = {placement = 'given', given = [[1, 0.1]]}\n", ["random.anchors.given", "2 pairs"]),
@@ -193,6 +204,49 @@ def test_what_is_no_sweep_is_one_line(text, words, folder):
 def test_a_malformed_grid_is_refused(argument):
     with pytest.raises(SceneError, match="--grid"):
         grid_axes([argument])
+
+
+def test_an_axis_of_vectors_on_the_command_line_and_one_given_twice():
+    vectors = grid_axes(["external.force_per_length=[0,0,1],[0,0,2]", "motor.torque=1,2"])
+    assert vectors == {"external.force_per_length": [[0, 0, 1], [0, 0, 2]], "motor.torque": [1, 2]}
+    with pytest.raises(SceneError, match="is given twice"):
+        grid_axes(["motor.torque=1,2", "motor.torque=3,4"])
+
+
+def test_a_sweep_of_python_values_is_read_back_the_same(tmp_path):
+    """Arrays of NumPy, ranges and None are written as what TOML has."""
+    axes = {
+        "motor.torque": np.linspace(1.0, 2.0, 3),
+        "flagella.count": range(2, 4),
+        "steric.enabled": np.array([True, False]),
+        "numerics.time_step": (None, np.float64(1e-7)),
+        "external.force_per_length": np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]),
+        "motor.axis_angle": {"from": 40, "to": 50, "count": 2},
+    }
+    plan = Sweep(small(), axes, {"draws": np.int64(2), "fluid.viscosity": {"low": np.float64(1e-3), "high": 2e-3}})
+    started = start(plan, str(tmp_path / "out"))
+    again = resume(tmp_path / "out")
+    assert [member.values for member in again.members] == [member.values for member in started.members]
+    assert [dumps(member.scene) for member in again.members] == [dumps(member.scene) for member in started.members]
+    assert len(started.members) == 192 and started.members[0].scene.numerics.time_step is None
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("base.toml", {}),
+        (small(), {"motor.torque": 2.0}),
+        (small(), {"motor.torque": "12"}),
+        (small(), {"motor.torque": []}),
+        (small(), ["motor.torque"]),
+        (small(), {}, None),
+        (small(), {}, {}, 0),
+        (small(), {}, {}, 1, "a/b"),
+    ],
+)
+def test_what_is_no_sweep_in_python_is_refused_at_once(arguments):
+    with pytest.raises(SceneError):
+        Sweep(*arguments)
 
 
 def test_all_bad_members_are_named_before_anything_starts(folder, monkeypatch):
@@ -260,7 +314,7 @@ def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
     scenes = [small(), small()]
     with pool.Pool(["somewhere"], {}, worker=Instant) as workers, Stop() as stop:
         workers.start(scenes[0], stop)
-        workers.submit(pool.Batch([0, 1], [Path("0"), Path("1")], scenes))
+        workers.submit(batches.Batch([0, 1], [Path("0"), Path("1")], scenes))
         ended = []
         while not workers.is_done:
             workers.wait()
@@ -296,7 +350,7 @@ def test_workers_end_as_the_sweep_does(status, number):
 
     with pool.Pool(["somewhere"], {}, worker=Running) as workers, Stop() as stop:
         workers.start(small(), stop)
-        workers.submit(pool.Batch([0], [Path("0")], [small()]))
+        workers.submit(batches.Batch([0], [Path("0")], [small()]))
         assert made[0].asked.wait(30.0)
         workers.end(status)
         ((_, outcomes),) = workers.finished()
@@ -318,3 +372,54 @@ def test_means_are_of_the_repeats_that_are_done(tmp_path):
     assert float(mean["rates.net_speed"]) == 2.5 and float(mean["rates.net_speed.error"]) == pytest.approx(1.5)
     assert float(mean["events.zipped"]) == 2e-3 and mean["events.zipped.count"] == "1"
     assert mean["events.zipped.error"] == ""
+
+
+@pytest.mark.parametrize("count, size", [(24, 12), (24, 24), (25, 12), (7, 3), (1000, 64), (5, 1), (1, 64)])
+def test_every_member_is_in_one_batch_and_batches_are_equal(count, size):
+    group = list(range(100, 100 + count))
+    cut = batches.cut(group, size)
+    assert sorted(k for own in cut for k in own) == group
+    lengths = [len(own) for own in cut]
+    assert max(lengths) <= size and max(lengths) - min(lengths) <= 1 and len(cut) == -(-count // size)
+    assert cut == batches.cut(group, size)
+
+
+@pytest.mark.parametrize("period", [2, 3, 5, None])
+def test_no_batch_gets_the_long_members(period):
+    """Costs that grow along an axis, or repeat along the last one."""
+    cost = np.arange(48.0) if period is None else np.arange(48.0) % period
+    sums = [cost[own].sum() for own in batches.cut(range(48), 12)]
+    assert max(sums) < 1.2 * np.mean(sums)  # 1.8 in order, 2.0 every fourth
+
+
+def test_the_size_of_batches_follows_what_was_measured():
+    best_size = batches.best_size
+    assert best_size(8, 2, alone=0.3, together=0.4, sample=8, largest=64)[0] == 1  # a batch is dearer
+    assert best_size(8, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 8  # one worker takes all
+    assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
+    assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
+    assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
+    # A member takes 0.1 s of its own, and a batch 0.2 s once: alone 0.3, in a batch of 8 0.125 s.
+    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=64)
+    assert (size, seconds) == pytest.approx((64, 64 * 0.1 + 0.2))
+    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=16)
+    assert (size, seconds) == pytest.approx((16, 64 * 0.1 + 4 * 0.2))
+    size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
+    assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
+
+
+@pytest.mark.parametrize("duration, measured", [(4e-5, False), (0.9, True)])
+def test_only_what_takes_long_is_measured(tmp_path, monkeypatch, capsys, duration, measured):
+    asked = []
+    monkeypatch.setattr(Pool, "measure", lambda self, samples, *_: asked.append(samples) or [0.4, 0.1])
+    base = small({"duration": duration, "frames": 4, "flagella.length": 6.0})
+    started = start(Sweep(base, {"motor.torque": [1.0, 2.0, 3.0, 3.4]}), str(tmp_path / "out"))
+    workers = Pool(["cpu"] * 2, {})
+    found = started._batches(workers, [0, 1, 2, 3], False, None)  # pyright: ignore[reportArgumentType]
+    assert bool(asked) == measured
+    assert sorted(map(len, (own.members for own in found))) == [2, 2]
+    said = capsys.readouterr().err
+    assert "4 members on 2 workers (cpu), batches of 2" in said and ("0.4 s alone" in said) == measured
+    for own in found:
+        assert [path.name for path in own.directories] == [f"{k:04d}" for k in own.members]
+        assert [scene.name for scene in own.scenes] == [started.members[k].scene.name for k in own.members]

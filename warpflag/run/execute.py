@@ -162,9 +162,8 @@ class Run:
         """Records frames; returns the cells whose last ones were among them."""
 
         def write(cell: int) -> bool:
-            for frame in (frames[cell] for frames in block if cell in frames):
-                at_end = self._guarded(cell, lambda f=frame: self.members[cell].write(f))
-            return at_end
+            own = [frames[cell] for frames in block if cell in frames]
+            return bool(self._guarded(cell, lambda: self.members[cell].write(own)))
 
         return {c for c, at_end in self._of_each({c for frames in block for c in frames}, write) if at_end}
 

@@ -10,7 +10,7 @@ __all__ = ["LOCK_NAME", "SWEEP_NAME", "Lock", "LockedError"]
 LOCK_NAME, SWEEP_NAME = ".lock", "sweep.toml"
 
 _open_files: dict[Path, int] = {}
-_held: set[tuple[Path, int]] = set()
+_held: dict[Path, set[int]] = {}  # bytes of each file that this process has locked
 
 
 class LockedError(ValueError):
@@ -35,20 +35,22 @@ class Lock:
         member = (directory.parent / SWEEP_NAME).is_file() and directory.name.isdecimal()
         file = (directory.parent if member else directory) / LOCK_NAME
         self._key = (file, int(directory.name) + 1 if member else 0)
-        if self._key in _held or not _locked(*self._key):
+        if self._key[1] in _held.get(file, ()) or not _locked(*self._key):
             raise LockedError(f"{directory}: is being written by another process")
-        _held.add(self._key)
+        _held.setdefault(file, set()).add(self._key[1])
 
     def release(self) -> None:
         """Lets the directory go; calling it again does nothing."""
-        if self._key not in _held:
-            return
-        _held.discard(self._key)
         file, slot = self._key
-        if any(other == file for other, _ in _held):
+        if slot not in _held.get(file, ()):
+            return
+        _held[file].discard(slot)
+        if _held[file]:
             _unlock(file, slot)
         else:
-            os.close(_open_files.pop(file))  # closing lets all locks go
+            del _held[file]
+            if file in _open_files:
+                os.close(_open_files.pop(file))  # closing lets all locks go
 
 
 def _locked(file: Path, slot: int) -> bool:
@@ -62,7 +64,7 @@ def _locked(file: Path, slot: int) -> bool:
     try:
         fcntl.lockf(_open_files[file], fcntl.LOCK_EX | fcntl.LOCK_NB, 1, slot)
     except (BlockingIOError, PermissionError):
-        if not any(other == file for other, _ in _held):
+        if not _held.get(file):
             os.close(_open_files.pop(file))
         return False
     except OSError:

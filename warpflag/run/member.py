@@ -8,7 +8,7 @@ import functools
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -96,16 +96,18 @@ class Member:
         """Opens the record; flagellum k has the nodes first_node[k] to first_node[k + 1] - 1."""
         start_reporter(self.recorder, self.scene, first_node, self.text)
 
-    def write(self, frame: Frame) -> bool:
-        """Records a frame; returns whether it was the last of the scene.
+    def write(self, frames: Sequence[Frame]) -> bool:
+        """Records frames, one at least; returns whether the last of the scene was among them.
 
         Raises:
             OSError: the disk is all but full; what was recorded before still fits.
         """
-        needed = _LEAST_ROOM + _FRAMES_OF_ROOM * (frame.positions.nbytes + frame.directors.nbytes)
+        count = max(_FRAMES_OF_ROOM, len(frames) + _FRAMES_PER_COMMIT)
+        needed = _LEAST_ROOM + count * (frames[0].positions.nbytes + frames[0].directors.nbytes)
         if shutil.disk_usage(self.directory).free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.directory))
-        self.recorder.write(frame)
+        for frame in frames:
+            self.recorder.write(frame)
         return self.recorder.frame_count == self.scene.frames + 1
 
     def save(self, arrays: Mapping[str, np.ndarray], device: str, sync: bool = True) -> None:

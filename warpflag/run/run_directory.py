@@ -180,8 +180,11 @@ def check_same_scene(directory: Path, scene: Scene) -> None:
     Raises:
         RunError: it is another one, and in which setting.
     """
+    text = dumps(scene)
+    if (directory / SCENE_NAME).read_bytes() == text.encode():
+        return
     there = load(directory / SCENE_NAME)
-    if dumps(there) != dumps(scene):
+    if dumps(there) != text:
         raise RunError(f"{directory}: holds the run of another scene: {_difference(there, scene)}")
 
 
@@ -197,10 +200,21 @@ def settings_of(scene: Scene, text: str | None = None) -> dict[str, str]:
     settings: dict[str, str] = {}
     section, tables = "", 0
     for line in (text or dumps(scene)).splitlines():
-        if header := re.match(r"\[+([\w.]+)\]+", line):
-            section = header[1]
+        header, key, value = _parts(line)
+        if header:
+            section = header
             if line.startswith("[["):
                 section, tables = f"{section}.{tables}", tables + 1
-        elif value := re.match(r"(?:# )?(\w+) =\s*(.*?)\s*(?:#.*)?$", line):
-            settings[f"{section}.{value[1]}".lstrip(".")] = value[2] or "none"
+        elif key:
+            settings[f"{section}.{key}" if section else key] = value
     return settings
+
+
+@functools.lru_cache(maxsize=4096)  # scenes of a batch have most of their lines in common
+def _parts(line: str) -> tuple[str, str, str]:
+    """Of a line of a scene: the name of a table, or the key of a value and the value; empty where it has none."""
+    if header := re.match(r"\[+([\w.]+)\]+", line):
+        return header[1], "", ""
+    if value := re.match(r"(?:# )?(\w+) =\s*(.*?)\s*(?:#.*)?$", line):
+        return "", value[1], value[2] or "none"
+    return "", "", ""

@@ -208,11 +208,7 @@ class Simulation:
             recording: frames will be taken.
             quiet: say nothing while kernels are compiled.
         """
-        if recording and not self._frames.taken:
-            self._take_frames()
-        if not self._loaded:
-            load_kernels(self._launch_all, self.device, quiet)
-            self._loaded = True
+        self.load(recording, quiet)
         if not self._checked:
             self._check_start()
         if not self._capture or self._graph is not None:
@@ -220,6 +216,15 @@ class Simulation:
         with wp.ScopedCapture(device=self.device) as captured:
             wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
         self._graph = captured.graph
+
+    @alone
+    def load(self, recording: bool = False, quiet: bool = False) -> None:
+        """Loads every kernel, of which `prepare` sees to the rest as well; arguments as there."""
+        if recording and not self._frames.taken:
+            self._take_frames()
+        if not self._loaded:
+            load_kernels(self._launch_all, self.device, quiet)
+            self._loaded = True
 
     def _take_frames(self) -> None:
         """Has the stepper take frames; a pass that was captured without is captured anew."""

@@ -22,8 +22,10 @@ A sweep file:
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,7 @@ __all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_
 BASE_NAME = "base.toml"
 _KEYS = ("base", "name", "repeats", "set", "axes", "random")
 _MOST_MEMBERS = 1_000_000  # of a sweep: more is a slip in its axes, and their scenes would take gigabytes
+_OUTER_COMMA = re.compile(r",(?![^\[]*\])")  # one that is not within brackets
 
 
 class BadMembers(ValueError):
@@ -94,17 +97,35 @@ class Sweep:
 
     Attributes:
         base: the scene that all members share but for their values.
-        axes: values by dotted key; the members are all combinations, the last axis fastest.
+        axes: values by dotted key, or from, to and count; the members are all combinations, the last axis fastest.
+            None takes a value of the base away. What is given as arrays of NumPy is kept as lists.
         random: as the table [random] of a sweep file, dotted keys flat.
         repeats: of every combination and draw.
-        name: of the sweep's directory.
+        name: of the sweep's directory; empty: that of the base.
+
+    Raises:
+        SceneError: one of them is of another kind.
     """
 
     base: Scene
-    axes: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    axes: Mapping[str, Any] = field(default_factory=dict)
     random: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     name: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.base, Scene):
+            raise SceneError("base", _plain(self.base), "must be a scene; warpflag.load reads one")
+        for name in ("axes", "random"):
+            given = getattr(self, name)
+            if not isinstance(given, Mapping):
+                raise SceneError(name, _plain(given), "must be values by dotted key")
+            object.__setattr__(self, name, {str(key): _plain(value) for key, value in given.items()})
+        axes = {key: _axis(f"axes.{key}", values) for key, values in self.axes.items()}
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "repeats", _count("repeats", _plain(self.repeats)))
+        object.__setattr__(self, "name", self.name or self.base.name)
+        with_values(self.base, {"name": self.name})  # whether it can be one
 
     def members(self) -> list[Member]:
         """Every member, in order.
@@ -114,9 +135,9 @@ class Sweep:
             SceneError: the sweep itself is not sound.
         """
         for key, values in self.axes.items():
-            check_key(key, list(values))
+            _check_axis(key, list(values))
         random = draws.Draws(self.random, self.base)
-        repeats = _count("repeats", self.repeats)
+        repeats = self.repeats
         noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in self.axes
         seeded = noise or "markov" in (self.base.motor.switching, *self.axes.get("motor.switching", ()))
         if repeats > 1 and not random.differs_in_repeats and not seeded:
@@ -131,24 +152,38 @@ class Sweep:
         combinations = itertools.product(*self.axes.values())
         for point, (combination, draw) in enumerate(itertools.product(combinations, range(random.count))):
             for repeat in range(repeats):
-                number = point * repeats + repeat
-                axes = dict(zip(self.axes, combination, strict=True))
-                label = f"member {number:0{width}d}"
+                number = f"{point * repeats + repeat:0{width}d}"
                 try:
-                    own = with_values(self.base, axes)
-                    values = axes | random.values(own, draw, repeat)
-                    scene = with_values(self.base, {**values, "name": f"{self.base.name}-{number:0{width}d}"})
+                    values, scene = self._varied(random, combination, draw, repeat)
+                    scene = with_values(scene, {"name": f"{self.base.name}-{number}"})
                 except SceneError as error:
-                    bad[label] = error
+                    bad[f"member {number}"] = error
                     continue
-                members.append(Member(number, point, repeat, values, scene))
+                members.append(Member(int(number), point, repeat, values, scene))
         check_members(bad)
         return members
+
+    def _varied(
+        self, random: draws.Draws, combination: Sequence[Any], draw: int, repeat: int
+    ) -> tuple[dict[str, Any], Scene]:
+        """The values of one member by dotted key, and its scene."""
+        axes = dict(zip(self.axes, combination, strict=True))
+        drawn = random.values(with_values(self.base, axes), draw, repeat)
+        for key in axes.keys() & drawn.keys():
+            raise SceneError(f"axes.{key}", list(self.axes[key]), "is drawn at random, too: leave out one of both")
+        values = axes | drawn
+        return values, with_values(self.base, values)
+
+    def first_scene(self) -> Scene | None:
+        """That of the first member, without a look at the others; None where it can't be simulated."""
+        with contextlib.suppress(SceneError, IndexError):
+            return self._varied(draws.Draws(self.random, self.base), [v[0] for v in self.axes.values()], 0, 0)[1]
+        return None
 
     def dumps(self) -> str:
         """The sweep as TOML beside its base scene; a sweep read from it has the same members."""
         lines = ["# A sweep of warpflag; its base scene lies beside it.", "", f"base = {written(BASE_NAME)}"]
-        lines += [f"name = {written(self.name or self.base.name)}", f"repeats = {self.repeats}", "", "[axes]"]
+        lines += [f"name = {written(self.name)}", f"repeats = {self.repeats}", "", "[axes]"]
         lines += [f"{written(key)} = {_inline(list(values))}" for key, values in self.axes.items()]
         lines += ["", "[random]", *(f"{written(key)} = {_inline(value)}" for key, value in self.random.items())]
         return "\n".join(lines) + "\n"
@@ -208,7 +243,7 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
     Raises:
         SceneError: an argument has another form.
     """
-    axes = {}
+    axes: dict[str, list[Any]] = {}
     for argument in arguments:
         key, sign, text = argument.partition("=")
         parts = text.split(":")
@@ -217,16 +252,20 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
                 raise ValueError
             if len(parts) == 3:
                 table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
-                axes[key] = _axis(key, table)
+                found = _axis(key, table)
             else:
-                axes[key] = [read_overrides([f"{key}={item}"])[key] for item in text.split(",") if item]
+                items = filter(None, _OUTER_COMMA.split(text))
+                found = [read_overrides([f"{key}={item}"])[key] for item in items]
         except ValueError as error:
             if isinstance(error, SceneError):
                 raise error.located("--grid") from None
             problem = "must be written key=from:to:count or key=a,b,c"
             raise SceneError(key, text, problem, source="--grid") from None
-        if not axes[key]:
+        if not found:
             raise SceneError(key, text, "has no values", source="--grid")
+        if key in axes:
+            raise SceneError(key, text, "is given twice", source="--grid")
+        axes[key] = found
     return axes
 
 
@@ -239,6 +278,35 @@ def _axis(key: str, values: Any) -> list[Any]:
         if all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
             return [float(value) for value in np.linspace(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
     raise SceneError(key, values, "must be a list of values, or { from = , to = , count = }")
+
+
+def _plain(value: Any) -> Any:
+    """A value as TOML has it: numbers and arrays of NumPy as Python's, sequences as lists, None as "absent"."""
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes):
+        return [_plain(item) for item in value]
+    return "absent" if value is None else value
+
+
+def _check_axis(key: str, values: list[Any]) -> None:
+    """That scenes have the key of an axis, and that no two of its values make the same members.
+
+    Raises:
+        SceneError: they have it not, or they do.
+    """
+    check_key(key, values)
+    if key == "name":
+        raise SceneError(f"axes.{key}", values, "is no axis: members are named after the sweep and their numbers")
+    found: set[str] = set()
+    for value in values:
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+        text = written(float(value) if number else value)
+        if text in found:
+            raise SceneError(f"axes.{key}", values, f"has {text} twice, which makes the same members twice")
+        found.add(text)
 
 
 def _count(key: str, value: Any) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import queue
 import signal
@@ -12,17 +11,16 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from warpflag.base.forked import ONE_THREAD, Forked, Starter
 from warpflag.run.member import Outcome
 from warpflag.run.stop import Stop
+from warpflag.run.sweep.batches import Batch
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Batch", "Pool", "best_size"]
+__all__ = ["Pool"]
 
 _SECONDS_PER_LOOK = 0.1  # at the workers: a moment for a person, nothing beside a member
 _MODULE = "warpflag.run.sweep.worker"
@@ -39,21 +37,6 @@ def _interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Members that one simulation advances.
-
-    Attributes:
-        members: their numbers.
-        directories: of their runs.
-        scenes: theirs.
-    """
-
-    members: Sequence[int]
-    directories: Sequence[Path]
-    scenes: Sequence[Scene]
 
 
 class Worker:
@@ -188,7 +171,9 @@ class Pool:
         return self._done_time + sum(worker.reached for worker in self._workers)
 
     def measure(self, samples: Sequence[Sequence[Scene]], stop: Stop, quiet: bool = False) -> list[float]:
-        """Wall time per cell of its start and of its run [s], of each sample of scenes advanced together.
+        """Time per cell of its start and of its run [s], of each sample of scenes advanced together.
+
+        On the CPU it is computing time, which what else the machine does leaves alone.
 
         Two workers measure at the same time, as they will run. A sample that can't be run costs nothing: one by one,
         each member tells what is wrong.
@@ -272,32 +257,3 @@ class Pool:
             self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes], worker.reached))
             worker.reached = 0.0
             self._batch_ended.set()
-
-
-def best_size(count: int, workers: int, alone: float, together: float, sample: int, largest: int) -> tuple[int, float]:
-    """Members of a batch with which the sweep is expected to end first, the fewest of those.
-
-    A member of a batch of s takes a + b / s: what a batch shares is spread over its members. Members differ, and which
-    are the long ones is not known, so the last batch is taken to keep one worker busy for half its length alone.
-
-    Args:
-        count: members to run.
-        workers: processes that take batches.
-        alone: time of a member by itself [s].
-        together: time per member in a batch of `sample` [s].
-        sample: members of the batch that was measured.
-        largest: most members of a batch.
-
-    Returns:
-        Members of a batch, and the wall time that is expected [s].
-    """
-    shared = min(max(0.0, (alone - together) / (1.0 - 1.0 / sample)), alone)
-    own = alone - shared
-
-    def expected(size: int) -> float:
-        rounds = math.ceil(math.ceil(count / size) / workers)
-        even = min(rounds * size, count) if workers > 1 else count
-        return (own + shared / size) * (even + (0.5 * size if workers > 1 else 0.0))
-
-    size = min(range(1, min(count, largest) + 1), key=expected)
-    return size, expected(size)

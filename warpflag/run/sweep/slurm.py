@@ -17,7 +17,7 @@ from warpflag.base.exit_status import TERMINATED
 from warpflag.base.output import missing
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
-from warpflag.run.sweep.sweep import FINISHED, SweepRun
+from warpflag.run.sweep.sweep import FINISHED, SweepRun, counted_members
 
 __all__ = ["Jobs", "Share"]
 
@@ -139,7 +139,7 @@ class Jobs:
             name = jobs[0].job_id.split("_")[0]
         except (RuntimeError, OSError, subprocess.CalledProcessError) as error:  # FailedJobError is of the first
             raise RunError(f"--slurm: {' '.join(str(error).split())}") from None
-        members = f"{self.sweep.sweep.name}: {len(self.sweep.members)} members"
+        members = f"{self.sweep.sweep.name}: {counted_members(len(self.sweep.members))}"
         return (
             f"{members} in {count} jobs of {slurm_time(self.seconds)}, array {name}; "
             f"when they are done, warpflag sweep --resume {directory} writes the table"

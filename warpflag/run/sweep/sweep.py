@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from warpflag.base.device import cores, start_warp
+from warpflag.base.device import cores, find_device, start_warp
 from warpflag.base.forked import Starter
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
-from warpflag.model.build import switches_of
 from warpflag.model.starts import Starts
 from warpflag.run.lock import SWEEP_NAME, Lock, LockedError
 from warpflag.run.member import Outcome
-from warpflag.run.run import begun_at_checkpoint
 from warpflag.run.run_directory import RunError, check_same_scene, claim_directory, write_whole
 from warpflag.run.stop import Ended, Stop
-from warpflag.run.sweep import table
+from warpflag.run.sweep import batches, table
+from warpflag.run.sweep.batches import Batch
 from warpflag.run.sweep.plan import BASE_NAME, Member, Sweep, check_members, read
-from warpflag.run.sweep.pool import Batch, Pool, best_size
-from warpflag.scene import SceneError
+from warpflag.run.sweep.pool import Pool
+from warpflag.scene import Scene, SceneError
 from warpflag.scene.resistance import filament_mobility
 
 __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
@@ -49,7 +50,7 @@ class SweepRun:
     sweep: Sweep
     members: list[Member]
 
-    @property
+    @functools.cached_property
     def names(self) -> list[str]:
         """Names of the members' directories."""
         width = max(4, len(str(len(self.members) - 1)))
@@ -85,35 +86,52 @@ class SweepRun:
         Returns:
             done; stopped, where guards stopped members; failed, where the machine failed some; interrupted or
             terminated.
+
+        Raises:
+            DeviceError: there is no such device.
+            ValueError: there are no such shares or workers.
         """
         if stop is None:
             with Stop() as signals:
                 return self.execute(workers, device, quiet, signals, movies, share, checkpoint_seconds, starter)
         began = monotonic()
+        if not 0 <= share[0] < share[1]:
+            raise ValueError(f"share = {share}: must be (k, n) with k from 0 to n - 1")
+        if workers is not None and workers < 1:
+            raise ValueError(f"workers = {workers}: must be a whole number from 1 on")
         own = range(len(self.members))[share[0] :: share[1]]
-        pending = [k for k in own if table.status_of(self.directory / self.names[k]) not in FINISHED]
+        pending = [k for k in own if table.status_of(self._directory(k)) not in FINISHED]
         ended: Ended | None = None
         failed: dict[int, str] = {}
+        self._check_scenes(own)
         if pending:
-            self._check_begun(pending)
+            self._wait_for_locks(pending)
             options = {"movies": movies, "checkpoint_seconds": checkpoint_seconds}
             ended, failed = self._run(pending, workers, device, quiet, stop, options, starter)
         self._write_table()
-        return self._outcome(own, ended, failed, monotonic() - began)
+        return self._outcome(own, ended, failed if quiet else dict.fromkeys(failed, ""), monotonic() - began)
 
-    def _check_begun(self, pending: Sequence[int]) -> None:
-        """That what was begun is of this sweep, and that no other process is at it any more.
+    def _check_scenes(self, own: Sequence[int]) -> None:
+        """That what is there, done or begun, is of this sweep, whose files may have been edited.
+
+        Raises:
+            RunError: a member's directory holds another scene.
+        """
+        for k in own:
+            with contextlib.suppress(SceneError, OSError):  # what can't be read is told when the member is taken up
+                check_same_scene(self._directory(k), self.members[k].scene)
+
+    def _wait_for_locks(self, pending: Sequence[int]) -> None:
+        """Waits for other processes to let go what was begun.
 
         Raises:
             LockedError: a member is being written by another process.
-            RunError: a member's directory holds another scene.
         """
         until = monotonic() + _SECONDS_FOR_LOCKS
         for k in pending:
-            directory = self.directory / self.names[k]
+            directory = self._directory(k)
             if not begun_in(directory):
                 continue
-            check_same_scene(directory, self.members[k].scene)
             while True:  # workers of a sweep that was killed end a moment after it
                 try:
                     Lock(directory).release()
@@ -133,7 +151,7 @@ class SweepRun:
         options: dict[str, Any],
         starter: Starter | None,
     ) -> tuple[Ended | None, dict[int, str]]:
-        devices = [device] if device else _devices()
+        devices = [find_device(device).alias] if device else _devices()
         count = min(workers or (len(devices) if devices != ["cpu"] else cores()), len(pending))
         progress = Progress(sum(self.members[k].scene.duration for k in pending), quiet=quiet)
         failed: dict[int, str] = {}
@@ -142,8 +160,7 @@ class SweepRun:
         with Pool([devices[k % len(devices)] for k in range(count)], options, starter) as pool:
             try:
                 pool.start(self.members[pending[0]].scene, stop, quiet)
-                size = self._batch_size(pool, pending, count, quiet, stop)
-                for batch in self._batches(pending, size):
+                for batch in self._batches(pool, pending, quiet, stop):
                     pool.submit(batch)
                 progress.update(0.0)
                 while not pool.is_done:
@@ -167,54 +184,57 @@ class SweepRun:
                 progress.close()
         return ended, failed
 
-    def _batch_size(self, pool: Pool, pending: list[int], workers: int, quiet: bool, stop: Stop) -> int:
-        """Members of a batch, by what a few of them cost alone and together."""
-        group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
-        if len(group) < 2:
-            return 1
-        scenes = [self.members[k].scene for k in group]
-        alone, together = pool.measure([scenes[:1], scenes], stop, quiet)
-        kind = "cuda" if pool.devices[0].startswith("cuda") else "cpu"
-        size, seconds = best_size(len(pending), workers, alone, together, len(group), _LARGEST_BATCH[kind])
-        if not quiet:
-            idle = ", since batches would leave workers idle" if together < alone else ""
-            which = f"batches of {size}" if size > 1 else f"one by one{idle}"
-            tell(
-                f"{len(pending)} members on {workers} worker{'s' if workers > 1 else ''} "
-                f"({', '.join(dict.fromkeys(pool.devices))}), {which}, about {seconds:.2g} s: a member takes "
-                f"{alone:.2g} s alone, {together:.2g} s in a batch of {len(group)}"
-            )
-        return size
+    def _batches(self, pool: Pool, pending: list[int], quiet: bool, stop: Stop) -> list[Batch]:
+        """What the workers take: by what a few members cost alone and together, or, of a short sweep, equal shares."""
+        workers, kind = len(pool.devices), "cuda" if pool.devices[0].startswith("cuda") else "cpu"
+        largest, groups = _LARGEST_BATCH[kind], self._groups(pending)
+        if batches.is_short([self.members[k].scene for k in pending], workers):
+            sizes = [batches.share(len(group), workers, largest) for group in groups]
+            told = "equal shares: it is too short to measure first"
+        else:
+            size, told = self._measured_size(pool, groups, largest, quiet, stop)
+            sizes = [size] * len(groups)
+        cut = [own for group, size in zip(groups, sizes, strict=True) for own in batches.cut(group, size)]
+        if not quiet and len(pending) > 1:
+            most = max(map(len, cut))
+            which = f"batches of {most}" if most > 1 else "one by one"
+            on = f"{workers} worker{'s' if workers > 1 else ''} ({', '.join(dict.fromkeys(pool.devices))})"
+            tell(f"{counted_members(len(pending))} on {on}, {which}{', ' if told else ''}{told}")
+        return [Batch(own, [self._directory(k) for k in own], [self.members[k].scene for k in own]) for own in cut]
+
+    def _measured_size(
+        self, pool: Pool, groups: Sequence[Sequence[int]], largest: int, quiet: bool, stop: Stop
+    ) -> tuple[int, str]:
+        """Members of a batch with which the sweep ends first, and why."""
+        samples = self._samples(groups)
+        if len(samples[1]) < 2:
+            return 1, ""
+        alone, together = pool.measure(samples, stop, quiet)
+        count, sample = sum(map(len, groups)), len(samples[1])
+        size, seconds = batches.best_size(count, len(pool.devices), alone, together, sample, largest)
+        idle = "since batches would leave workers idle, " if size == 1 and together < alone else ""
+        costs = f"a member takes {alone:.2g} s alone, {together:.2g} s in a batch of {sample}"
+        return size, f"{idle}about {seconds:.2g} s: {costs}"
+
+    def _samples(self, groups: Sequence[Sequence[int]]) -> list[list[Scene]]:
+        """Members to measure alone and together: some of the largest group, from all over it."""
+        largest = max(groups, key=len)
+        own = [self.members[k].scene for k in batches.cut(largest, min(_SAMPLE_CELLS, len(largest)))[0]]
+        return [own[len(own) // 2 :][:1], own]
 
     def seconds_per_member(self, pending: Sequence[int], device: str | None, stop: Stop) -> float:
-        """Wall time of a member on one worker, the lesser of alone and in a batch, measured on a few of them [s]."""
-        group = max(self._groups(pending), key=len)[:_SAMPLE_CELLS]
-        scenes = [self.members[k].scene for k in group]
+        """Time of a member on one worker, the lesser of alone and in a batch, measured on a few of them [s]."""
+        samples = self._samples(self._groups(pending))
         with Pool([device or _devices()[0]], {}) as pool:
-            pool.start(scenes[0], stop)
-            return min(pool.measure([scenes[:1], scenes], stop))
+            pool.start(samples[0][0], stop)
+            return min(pool.measure(samples, stop))
+
+    def _directory(self, member: int) -> Path:
+        return self.directory / self.names[member]
 
     def _groups(self, pending: Sequence[int]) -> list[list[int]]:
-        """Members that one simulation can advance: the same terms, precision and stepper, all begun or none."""
-        groups: dict[object, list[int]] = {}
-        for k in pending:
-            scene = self.members[k].scene
-            numerics = scene.numerics
-            begun = begun_in(self.directory / self.names[k])
-            at_checkpoint = begun and begun_at_checkpoint(self.directory / self.names[k])
-            key = (switches_of(scene), numerics.precision, numerics.stepper, begun, at_checkpoint)
-            groups.setdefault(key, []).append(k)
-        return list(groups.values())
-
-    def _batches(self, pending: Sequence[int], size: int) -> list[Batch]:
-        batches = []
-        for group in self._groups(pending):
-            for first in range(0, len(group), size):
-                own = group[first : first + size]
-                directories = [self.directory / self.names[k] for k in own]
-                scenes = [self.members[k].scene for k in own]
-                batches.append(Batch(own, directories, scenes))
-        return batches
+        scenes = [member.scene for member in self.members]
+        return batches.groups(scenes, [self.directory / name for name in self.names], pending)
 
     def _write_table(self) -> None:
         """Writes the tables, unless another process writes them now."""
@@ -228,14 +248,16 @@ class SweepRun:
             lock.release()
 
     def _outcome(self, own: Sequence[int], ended: Ended | None, failed: dict[int, str], seconds: float) -> Outcome:
-        found = [table.status_of(self.directory / self.names[k]) for k in own]
+        found = [table.status_of(self._directory(k)) for k in own]
         counts = {status: found.count(status) for status in dict.fromkeys(found)}
         counted = ", ".join(f"{count} {status}" for status, count in counts.items())
-        told = f"{self.sweep.name}: {len(found)} members: {counted}"
+        told = f"{self.sweep.name}: {counted_members(len(found))}: {counted}"
         if ended is not None:
             reason = f" ({ended.reason})" if ended.reason else ""
             return Outcome(ended.status, f"{told}; {ended.status}{reason}; resumable with --resume {self.directory}")
         told += f" in {seconds:.1f} s: {self.directory / table.TABLE_NAME}"
+        first = next((f"; {message}" for message in failed.values() if message), "")
+        told += first + (f" (and {len(failed) - 1} more)" if first and len(failed) > 1 else "")
         if failed or set(counts) - set(FINISHED):
             return Outcome("failed", f"{told}; resumable with --resume {self.directory}")
         return Outcome("stopped" if "stopped" in counts else "done", told)
@@ -256,7 +278,7 @@ def start(sweep: Sweep, output: str | None = None) -> SweepRun:
     """
     members = sweep.members()
     _check_starts(members)
-    directory, lock = claim_directory(sweep.name or sweep.base.name, output)
+    directory, lock = claim_directory(sweep.name, output)
     write_whole(directory / BASE_NAME, sweep.base_text())
     write_whole(directory / SWEEP_NAME, sweep.dumps())
     lock.release()
@@ -313,6 +335,11 @@ def _check_starts(members: Sequence[Member]) -> None:
         except SceneError as error:
             bad[member.scene.name] = error
     check_members(bad)
+
+
+def counted_members(count: int) -> str:
+    """So many members in words."""
+    return f"{count} member{'s' if count != 1 else ''}"
 
 
 def _devices() -> list[str]:

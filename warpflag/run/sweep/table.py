@@ -70,7 +70,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         if isinstance(value, Mapping):
             flat |= _flat(value, f"{prefix}{name}.")
         elif isinstance(value, list):
-            numbers = [math.nan if item is None else float(item) for item in value]
+            numbers = [float(item) if isinstance(item, int | float) else math.nan for item in value]
             flat[f"{prefix}{name}"] = float(np.mean(numbers)) if numbers else math.nan
             flat |= {f"{prefix}{name}.{k}": item for k, item in enumerate(numbers)}
         else:
