@@ -18,7 +18,6 @@ from tests.runs import small
 from warpflag.model.geometry import initial_state
 from warpflag.run.stop import Stop
 from warpflag.run.sweep import BadMembers, Sweep, batches, grid_axes, pool, read, resume, start, table
-from warpflag.run.sweep.pool import Pool
 from warpflag.scene import SceneError, dumps, load, with_values
 
 
@@ -372,54 +371,3 @@ def test_means_are_of_the_repeats_that_are_done(tmp_path):
     assert float(mean["rates.net_speed"]) == 2.5 and float(mean["rates.net_speed.error"]) == pytest.approx(1.5)
     assert float(mean["events.zipped"]) == 2e-3 and mean["events.zipped.count"] == "1"
     assert mean["events.zipped.error"] == ""
-
-
-@pytest.mark.parametrize("count, size", [(24, 12), (24, 24), (25, 12), (7, 3), (1000, 64), (5, 1), (1, 64)])
-def test_every_member_is_in_one_batch_and_batches_are_equal(count, size):
-    group = list(range(100, 100 + count))
-    cut = batches.cut(group, size)
-    assert sorted(k for own in cut for k in own) == group
-    lengths = [len(own) for own in cut]
-    assert max(lengths) <= size and max(lengths) - min(lengths) <= 1 and len(cut) == -(-count // size)
-    assert cut == batches.cut(group, size)
-
-
-@pytest.mark.parametrize("period", [2, 3, 5, None])
-def test_no_batch_gets_the_long_members(period):
-    """Costs that grow along an axis, or repeat along the last one."""
-    cost = np.arange(48.0) if period is None else np.arange(48.0) % period
-    sums = [cost[own].sum() for own in batches.cut(range(48), 12)]
-    assert max(sums) < 1.2 * np.mean(sums)  # 1.8 in order, 2.0 every fourth
-
-
-def test_the_size_of_batches_follows_what_was_measured():
-    best_size = batches.best_size
-    assert best_size(8, 2, alone=0.3, together=0.4, sample=8, largest=64)[0] == 1  # a batch is dearer
-    assert best_size(8, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 8  # one worker takes all
-    assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
-    assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
-    assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
-    # A member takes 0.1 s of its own, and a batch 0.2 s once: alone 0.3, in a batch of 8 0.125 s.
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=64)
-    assert (size, seconds) == pytest.approx((64, 64 * 0.1 + 0.2))
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=16)
-    assert (size, seconds) == pytest.approx((16, 64 * 0.1 + 4 * 0.2))
-    size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
-    assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
-
-
-@pytest.mark.parametrize("duration, measured", [(4e-5, False), (0.9, True)])
-def test_only_what_takes_long_is_measured(tmp_path, monkeypatch, capsys, duration, measured):
-    asked = []
-    monkeypatch.setattr(Pool, "measure", lambda self, samples, *_: asked.append(samples) or [0.4, 0.1])
-    base = small({"duration": duration, "frames": 4, "flagella.length": 6.0})
-    started = start(Sweep(base, {"motor.torque": [1.0, 2.0, 3.0, 3.4]}), str(tmp_path / "out"))
-    workers = Pool(["cpu"] * 2, {})
-    found = started._batches(workers, [0, 1, 2, 3], False, None)  # pyright: ignore[reportArgumentType]
-    assert bool(asked) == measured
-    assert sorted(map(len, (own.members for own in found))) == [2, 2]
-    said = capsys.readouterr().err
-    assert "4 members on 2 workers (cpu), batches of 2" in said and ("0.4 s alone" in said) == measured
-    for own in found:
-        assert [path.name for path in own.directories] == [f"{k:04d}" for k in own.members]
-        assert [scene.name for scene in own.scenes] == [started.members[k].scene.name for k in own.members]
