@@ -126,7 +126,7 @@ def test_only_what_takes_long_is_measured(tmp_path, monkeypatch, capsys, duratio
     base = small({"duration": duration, "frames": 4, "flagella.length": 6.0})
     started = sweep.start(Sweep(base, {"motor.torque": [1.0, 2.0, 3.0, 3.4]}), str(tmp_path / "out"))
     workers = Pool(["cpu"] * 2, {})
-    found = started._batches(workers, [0, 1, 2, 3], False, None)  # pyright: ignore[reportArgumentType]
+    found = started.batches_for(workers, [0, 1, 2, 3], False, None)  # pyright: ignore[reportArgumentType]
     assert bool(asked) == measured
     assert sorted(map(len, (own.members for own in found))) == [2, 2]
     said = capsys.readouterr().err

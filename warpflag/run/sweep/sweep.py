@@ -160,7 +160,7 @@ class SweepRun:
         with Pool([devices[k % len(devices)] for k in range(count)], options, starter) as pool:
             try:
                 pool.start(self.members[pending[0]].scene, stop, quiet)
-                for batch in self._batches(pool, pending, quiet, stop):
+                for batch in self.batches_for(pool, pending, quiet, stop):
                     pool.submit(batch)
                 progress.update(0.0)
                 while not pool.is_done:
@@ -184,7 +184,7 @@ class SweepRun:
                 progress.close()
         return ended, failed
 
-    def _batches(self, pool: Pool, pending: list[int], quiet: bool, stop: Stop) -> list[Batch]:
+    def batches_for(self, pool: Pool, pending: list[int], quiet: bool, stop: Stop) -> list[Batch]:
         """What the workers take: by what a few members cost alone and together, or, of a short sweep, equal shares."""
         workers, kind = len(pool.devices), "cuda" if pool.devices[0].startswith("cuda") else "cpu"
         largest, groups = _LARGEST_BATCH[kind], self._groups(pending)
