@@ -27,6 +27,9 @@ def by_elements(own: Plan, **choices: Any) -> Plan:
 
 
 def as_on_gpu(own: Plan, block: int = BLOCK) -> Plan:
-    """As on a GPU: a warp gathers the pairs of a node, a block solves the contacts of a cell."""
+    """As on a GPU: a warp gathers the pairs of a node, a block solves the contacts of a cell.
+
+    On a CPU `wp.config.enable_cpu_blocks` has to be set; the threads of a block are fibers then.
+    """
     pairs = "none" if own.pair_sum == "none" else "warp"
     return by_elements(own, pair_sum=pairs, contact_block=block)

@@ -92,7 +92,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             c3 = model.rod.hook_rigidity[k] / h
             w3 = twist
         m3 = c3 * w3
-        # Bending; the hook has none.
+        # Bending. That of the hook, joint 0, is added by `motor/hook.py`.
         c = real(0.0)
         m1 = real(0.0)
         m2 = real(0.0)
