@@ -49,8 +49,8 @@ THETA = 0.8
 # not add up over time.
 ERROR_PER_PREDICTOR = 3.5
 # Over-implicitness up to which a step begins with the whole prediction, equal to the least that a step has,
-# `stability.LEAST`. With more, two iterations leave so much of a prediction in stiff modes that an extrapolation through
-# three states would ring (docs/numerics.md).
+# `stability.LEAST`. With more, two iterations leave so much of a prediction in stiff modes that an extrapolation
+# through three states would ring (docs/numerics.md).
 BEGUN_WHOLE = 1.3
 GAP_SHARE = 0.1  # residual of the gaps that the contact solve may leave, over the error that a step may make
 # A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
