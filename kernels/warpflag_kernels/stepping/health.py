@@ -87,7 +87,7 @@ def allocate(model: DeviceModel, chart: Any) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, listing: bool, with_self: bool) -> SimpleNamespace:
+def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Chart, Guard = chart_stage.struct(p), struct(p)
@@ -106,7 +106,7 @@ def _kernels(p: Precision, listing: bool, with_self: bool) -> SimpleNamespace:
     not_finite, crossing = encode(Fault.NOT_FINITE), encode(Fault.CROSSING)
     strained, twisted, folded = encode(Fault.STRAIN), encode(Fault.TWIST), encode(Fault.FOLD)
     turned, largest_turn = encode(Fault.TURN), real(LARGEST_TURN)
-    module = p.module("health", ("listing" if listing else "") + ("self" if with_self else ""))
+    module = p.module("health", "self" if with_self else "")
 
     @wp.func(module=module)
     def due(control: Control, guard: Guard, chart: Chart, c: wp.int32):
@@ -236,7 +236,7 @@ def _kernels(p: Precision, listing: bool, with_self: bool) -> SimpleNamespace:
         # A pair that can have met between the two checks is in the list of contacts, or in the neighbour lists, if no
         # node has been too far from its position when the list was made.
         as_contact = bool(False)
-        if wp.static(listing):
+        if listed.position.shape[0] > 0:
             strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
             as_contact = strayed < listed_reach * model.steric.diameter[c]
         shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
@@ -297,15 +297,14 @@ def _kernels(p: Precision, listing: bool, with_self: bool) -> SimpleNamespace:
             moved = wp.max(moved, wp.length(state.pose.position[e] - guard.position[e]))
             shifted = wp.max(shifted, wp.length(state.pose.position[e] - near.position[e]))
             shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
-            if wp.static(listing):
+            if listed.position.shape[0] > 0:
                 strayed = wp.max(strayed, wp.length(state.pose.position[e] - listed.position[e]))
                 strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
             e += 1
         guard.longest[k] = longest
         guard.moved[k] = moved
         guard.shifted[k] = shifted
-        if wp.static(listing):
-            guard.strayed[k] = strayed
+        guard.strayed[k] = strayed
 
     @wp.kernel(module=module)
     def remember(
@@ -336,12 +335,11 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
         chart, guard, control: structs `Chart`, `Guard`, `Control`.
         listed: struct `Contacts` of a search made between the last check and this one, if any.
     """
-    p, listing = model.precision, listed is not None
-    kernels = _kernels(p, listing, model.switches.self_contact)
+    kernels = _kernels(model.precision, model.switches.self_contact)
     inputs = [model.data, state.data, chart, guard, control]
     wp.launch(kernels.check_elements, model.element_count, inputs=inputs, device=model.device)
     if model.switches.steric:
-        found = listed if listing else contact_list.struct(p)()
+        found = contact_list.struct(model.precision)() if listed is None else listed  # without arrays: no list
         moves = [model.data, state.data, state.neighbours, found, guard]
         wp.launch(kernels.measure_moves, model.flagellum_count, inputs=moves, device=model.device)
         inputs = [model.data, state.data, chart, guard, state.neighbours, found, control]
@@ -352,5 +350,5 @@ def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, con
     """Stores the checked positions, from which the next check follows the segments."""
     if model.switches.steric:
         inputs = [model.data, state.data, control, chart, guard]
-        kernel = _kernels(model.precision, False, model.switches.self_contact).remember
+        kernel = _kernels(model.precision, model.switches.self_contact).remember
         wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
