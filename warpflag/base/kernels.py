@@ -65,7 +65,8 @@ def load_kernels(
     """
     with noted_launches() as noted:
         launch()
-    modules = {(kernel.module, None if device.is_cpu else block) for kernel, block in noted}  # a CPU has one form of each
+    # A CPU has one form of each module, whatever the blocks.
+    modules = {(kernel.module, None if device.is_cpu else block) for kernel, block in noted}
     waiting = sorted(((module, block) for module, block in modules), key=lambda own: (own[0].name, own[1] or 0))
     identifiers = {module.get_module_identifier(1 if device.is_cpu else block) for module, block in waiting}
     folders = {kernel_folder() / identifier for identifier in identifiers}

@@ -304,7 +304,7 @@ class Steric(Section, key="steric"):
     enabled: bool = switch(True, "flagella repel each other")
     strength: float = number(0.8, "pN", 1e-6, 1e5, "F_0, the force at distance sigma")
     diameter: float | None = number(None, "um", 1e-3, 1, "sigma", derived="4 flagella.filament_radius")
-    self_contact: bool = switch(False, "with enabled, a flagellum repels itself: segments over 3 sigma of contour apart")
+    self_contact: bool = switch(False, "with enabled, a flagellum repels itself: segments 3 sigma of contour apart")
 
 
 @dataclass(frozen=True)
