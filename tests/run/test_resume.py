@@ -155,7 +155,8 @@ def test_a_full_disk_fails_a_run_in_one_line_and_it_resumes(tmp_path, monkeypatc
         return usage._replace(free=usage.free if len(calls) <= 5 else 1000)
 
     monkeypatch.setattr(shutil, "disk_usage", filling)
-    outcome = run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0).execute(quiet=True)
+    with frame_by_frame():
+        outcome = run.start(small(), str(halved), "cpu", checkpoint_seconds=0.0).execute(quiet=True)
     assert outcome.status == "failed" and "\n" not in outcome.message
     assert "No space left" in outcome.message and str(halved) in outcome.message
     with Record(halved) as record:
