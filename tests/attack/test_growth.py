@@ -77,7 +77,7 @@ def parting(monkeypatch, scale):
     made = []
 
     class Parting:
-        def __init__(self, scenes, device, starts):
+        def __init__(self, scenes, device, starts, **_options):
             made.append(scenes)
             self.one, self.two = (np.concatenate(start.positions) for start in starts)
 

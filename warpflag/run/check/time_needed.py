@@ -82,6 +82,7 @@ def _observing(simulation: Simulation) -> float:
     state, first_node = simulation.cell_state(), simulation.first_node
     many = (_FRAMES_OBSERVED, 1, 1)
     positions, directors = np.tile(state.positions, many), np.tile(state.directors, many)
+    bundle_length(positions[:1], first_node)  # what the first call imports is paid once
     began = time.process_time()
     if len(first_node) > 2:
         phase_difference(positions, directors, first_node)
