@@ -147,7 +147,7 @@ def _looks(
         steps = {"numerics.time_step": taken, "numerics.accuracy": None}
         followed = with_values(scene, {"numerics.on_accuracy": "warn", **steps})
         starts = [start, dataclasses.replace(start, positions=tuple(moved))]
-        pair = Simulation([followed, followed], device=device, starts=starts, capture=FOLLOWED > _FEW_STEPS * taken)
+        pair = Simulation([followed, followed], device=device, starts=starts, capture=_FEW_STEPS * taken < FOLLOWED)
         for k in range(_LOOKS):
             within = FOLLOWED * (k + 1) / _LOOKS
             pair.advance(within, watch)
