@@ -31,6 +31,25 @@ def types(p: Precision) -> SimpleNamespace:
     return SimpleNamespace(Increment=Increment, vec6=vec6)
 
 
+@functools.cache
+def displacement(p: Precision) -> Any:
+    """Device function: the displacement of node e of flagellum k under an increment [um].
+
+    Its argument `position` are the nodes relative to the body centre [um], shape [E]: r_0 follows the body.
+    """
+    vec3, Model, Increment = p.vec3, structs(p).Model, types(p).Increment
+
+    @wp.func(module=p.module("displacement"))
+    def of_node(model: Model, position: wp.array(dtype=vec3), x: Increment, e: wp.int32, k: wp.int32):
+        if e == model.first_node[k]:
+            b = x.body[model.cell_of[e]]
+            return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), position[e])
+        n = x.node[e]
+        return vec3(n[0], n[1], n[2])
+
+    return of_node
+
+
 def allocate(model: DeviceModel) -> Any:
     """An increment of zero, struct `Increment`."""
     t = types(model.precision)

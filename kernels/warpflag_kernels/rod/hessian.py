@@ -41,7 +41,7 @@ def struct(p: Precision) -> Any:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Stiffness = structs(p).Model, structs(p).State, struct(p)
-    Increment = chain_chart.types(p).Increment
+    Increment, displacement = chain_chart.types(p).Increment, chain_chart.displacement(p)
     twist_angle = rotations.functions(p).twist_angle
     module = p.module("hessian")
 
@@ -149,15 +149,6 @@ def _kernels(p: Precision) -> SimpleNamespace:
         fe += wp.outer(ts, tm) - wp.outer(tm, us + (m3 * half) * kb) + wp.skew(sm - (m3 / chi) * t)
         stiffness.fe[i] = fe / (le * lf)
 
-    @wp.func(module=module)
-    def displacement(model: Model, state: State, x: Increment, e: wp.int32, k: wp.int32):
-        """Displacement of node e under an increment; r_0 follows the body."""
-        if e == model.first_node[k]:
-            b = x.body[model.cell_of[e]]
-            return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), state.pose.position[e])
-        n = x.node[e]
-        return vec3(n[0], n[1], n[2])
-
     @wp.kernel(module=module)
     def joint_changes(
         # Model:
@@ -174,14 +165,14 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if state.active[c] == 0:
             return
         b = x.body[c]
-        here = displacement(model, state, x, i, k)
+        here = displacement(model, state.pose.position, x, i, k)
         e = wp.cross(vec3(b[3], b[4], b[5]), state.pose.tangent[i])
         if i > model.first_node[k]:
-            e = here - displacement(model, state, x, i - 1, k)
+            e = here - displacement(model, state.pose.position, x, i - 1, k)
             state.stretch_change[i] = stiffness.stretch[i] * e
         if i + 1 == model.first_node[k + 1]:
             return
-        f = displacement(model, state, x, i + 1, k) - here
+        f = displacement(model, state.pose.position, x, i + 1, k) - here
         first = x.node[i][3]
         second = x.node[i + 1][3]
         ge = stiffness.ee[i] * e + wp.transpose(stiffness.fe[i]) * f

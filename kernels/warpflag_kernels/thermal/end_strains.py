@@ -44,6 +44,7 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     Strains, Additive = strain_gradients.struct(p), additive_chart.struct(p)
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
+    displacement = chain_chart.displacement(p)
     f, r = strain_gradients.functions(p), rotations.functions(p)
     joint_stiffness, joined, joint_strain, sine_cosine = f.joint_stiffness, f.joined, r.joint_strain, r.sine_cosine
     respond = body.mobility(p, shell).respond
@@ -55,15 +56,6 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
         """Strains of the joint after segment i."""
         pose = state.pose
         return joint_strain(pose.tangent[i], pose.tangent[i + 1], pose.director[i], pose.director[i + 1])
-
-    @wp.func(module=module)
-    def displacement(model: Model, chart: Chart, x: Increment, e: wp.int32, k: wp.int32):
-        """Displacement of node e under an increment; r_0 follows the body."""
-        if e == model.first_node[k]:
-            b = x.body[model.cell_of[e]]
-            return vec3(b[0], b[1], b[2]) + wp.cross(vec3(b[3], b[4], b[5]), chart.base.position[e])
-        n = x.node[e]
-        return vec3(n[0], n[1], n[2])
 
     @wp.kernel(module=module)
     def missed(
@@ -83,18 +75,18 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
             return
         k = model.flagellum_of[i]
         first = model.first_node[k]
-        here = displacement(model, chart, x, i, k)
+        here = displacement(model, chart.base.position, x, i, k)
         b = x.body[c]
         e = wp.cross(vec3(b[3], b[4], b[5]), chart.base.tangent[i])  # of the tripod's unit vector
         if i > first:
-            e = here - displacement(model, chart, x, i - 1, k)
+            e = here - displacement(model, chart.base.position, x, i - 1, k)
             t = chart.base.tangent[i]
             before = wp.length(chart.base.position[i] - chart.base.position[i - 1])
             longer = state.pose.length[i] - before - wp.dot(t, e)
             state.stretch_change[i] = (model.rod.stretching_stiffness[k] / model.rod.segment_length[k] * longer) * t
         if not joined(model, i, k):
             return
-        f = displacement(model, chart, x, i + 1, k) - here
+        f = displacement(model, chart.base.position, x, i + 1, k) - here
         one = x.node[i][3]
         two = x.node[i + 1][3]
         w = strain(state, i)
