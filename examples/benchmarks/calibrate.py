@@ -67,6 +67,7 @@ WINDOWS = {
     "contact": Window(2, 5.5e-3, 1.0e-3, 5),  # amid the zipping
     "bundle": Window(2, 8.5e-3, 1.0e-3, 5),  # the flagella lie side by side
     "crowd": Window(8, 3.0e-3, 5.0e-4, 2),  # eight flagella, whose contacts are forming
+    "entangled": Window(8, 5.0e-3, 5.0e-4, 2),  # the same amid hundreds of contacts
     "onset": Window(2, 0.0, 1.0e-4, 5),  # the motors are switched on
     # Three times the torque: contacts slam shut, steps are rejected.
     "hard": Window(2, 2.0e-3, 2.0e-4, 3, (("motor.torque", 10.0),)),
@@ -79,6 +80,7 @@ TWO = ("free", "contact", "bundle")
 TOUCHING = ("contact", "bundle", "crowd")
 CONTACT_LAW = ("stiff", "hard", "contact", "crowd")
 EXPLICIT = ("free", "contact", "crowd")
+CROWDED = ("crowd", "entangled")
 UPSET = ("hard", "onset", "crowd")
 REFERENCE_STEP = 5.0e-7  # of RKC [s]
 ACCURACIES = (5e-2, 5e-3, 5e-4)  # of RKC [um per ms]
@@ -130,7 +132,13 @@ CONSTANTS = {
     "stability.LEAST": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.OVER_IMPLICIT_PER_KAPPA": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.LARGEST_FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
-    "stability.MOST": Constant("implicit.stability", (5.0, 2.0, 3.0, 8.0), ("crowd",)),
+    "stability.MOST": Constant(
+        "implicit.stability",
+        (9.0, 2.0, 3.0, 5.0, 7.0),
+        CROWDED,
+        derived=lambda most: {"LARGE_KAPPA_OF_FLEXIBLE": most / 0.6},
+    ),
+    "stability.LARGE_KAPPA_OF_FLEXIBLE": Constant("implicit.stability", (15.0, 2.6, 3.7, 5.0, 10.0), CROWDED),
     "stability.FIRST_MEASUREMENTS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
     "contact_solve.DIAGONAL_PER_DRAG": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), CONTACT_LAW),
@@ -149,7 +157,7 @@ CONSTANTS = {
     "search.MARGIN": Constant(
         "contact.search", (0.3, 0.05, 0.15, 0.6), TOUCHING, derived=lambda margin: {"REACH": 2 ** (1 / 6) + margin}
     ),
-    "contact_list.PER_NODE": Constant("contact.contact_list", (4, 1, 2, 8), ("crowd",)),
+    "contact_list.PER_NEIGHBOUR": Constant("contact.contact_list", (1.5, 0.15, 0.5, 1.0), CROWDED),
     "neighbours.SKIN": Constant("contact.neighbours", (0.1, 0.025, 0.05, 0.2, 0.4), TOUCHING),
     "plan.STORED_NODES": Constant("base.plan", (512, 0), ("contact", "crowd")),
     "rotne_prager.FLOAT32_TERMS": Constant(

@@ -23,8 +23,10 @@ from tests.contacts import (
     steric_force,
     touching,
 )
+from tests.helpers import cell
 from tests.oracles import body_gaps, segment_distances
 from tests.plans import by_elements
+from warpflag.run.simulation import Simulation
 
 # The list.
 
@@ -128,6 +130,19 @@ def pose_gaps(l: Listed) -> np.ndarray:
             p, q = y[[e - 1]], y[[other - 1]]
             gaps.append(segment_distances(p, y[[e]] - p, q, y[[other]] - q)[0, 0])
     return np.array(gaps)
+
+
+def test_the_room_for_contacts_is_that_of_a_hexagonal_bundle(device):
+    """A node lies against six filaments at most, three segments of each, listed once, and against the body: ten."""
+
+    def room(values):
+        sim = Simulation(cell({"numerics.stepper": "implicit", **values}), device=device)
+        return int(sim.stepper.contacts.first.numpy()[-1]) / int(sim.first_node[-1])
+
+    crowd = {"body.length": 20.0, "body.width": 10.0, "flagella.anchor_offset": 0.0}
+    assert room({}) == 4
+    assert [room({**crowd, "flagella.count": n}) for n in (4, 7, 12)] == [6, 10, 10]
+    assert room({"flagella.count": 1, "steric.self_contact": True}) == 10  # a coil is a bundle of itself
 
 
 @pytest.mark.parametrize("name", ["all", "bundle", "anchored", "no body contact"])

@@ -88,7 +88,7 @@ def test_a_rejected_step_leaves_no_trace(device):
     with pytest.raises(NumericalError) as caught:
         sim.advance(2.5e-5)
     after, left = sim.cell_state(), sim.checkpoint()
-    assert caught.value.kind == Fault.UNSOLVED and counts(sim)[1] > rejected
+    assert caught.value.kind == Fault.CROWDED and counts(sim)[1] > rejected
     for name in ("time", "step", "positions", "directors", "motor_angle", "body_position", "body_orientation"):
         assert np.array_equal(getattr(before, name), getattr(after, name)), name
     changed = {name for name, values in memory.items() if not np.array_equal(values, left[name])}
@@ -178,7 +178,7 @@ def test_a_cell_whose_steps_cannot_be_solved_says_so_and_its_neighbours_go_on(de
     first.assign(first.numpy() + np.array([first.numpy()[1] - 1, 0, 0]))  # no room in the first cell
     with pytest.raises(NumericalError) as caught:
         batch.advance(2e-5)
-    assert caught.value.cell == 0 and caught.value.kind == Fault.UNSOLVED
+    assert caught.value.cell == 0 and caught.value.kind == Fault.CROWDED
     assert batch.times[0] == 0.0
     alone.advance(2e-5)
     assert np.array_equal(batch.cell_state(1).positions, alone.cell_state().positions)

@@ -46,8 +46,9 @@ _ADVICE = {
         "the fixed step is beyond what its stages keep stable",
         "take a shorter numerics.time_step, or leave it out",
     ),
+    Fault.CROWDED: ("more contacts at once than a step has room for", "take numerics.stepper = rkc"),
 }
-_OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE)
+_OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE, Fault.CROWDED)
 """Faults of a cell as a whole: no segment is to blame."""
 _NOTABLE = 3.0  # a value this many times from the default is named: factors of two are ordinary choices
 _EXTERNAL = 1.0  # weight of a force from outside among the causes, that of a value e times its default

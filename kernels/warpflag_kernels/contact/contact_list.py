@@ -16,7 +16,9 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.rod import chain_chart
 
-PER_NODE = 4  # contacts per node that a cell has room for; eight bundled flagella have three
+# Contacts per node that a cell has room for. A filament amid a hexagonal bundle lies against six others, and a segment
+# of it may touch three of each; pairs are listed once. Measured: 3 in eight bundled flagella, 3.5 in twelve, 4.1 in 20.
+NEAREST, PER_NEIGHBOUR, LEAST_PER_NODE = 6, 1.5, 4
 
 
 @functools.cache
@@ -237,7 +239,8 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
     """Arrays of the struct `Contacts`; room for one contact a cell where nothing can touch."""
     p, device = model.precision, model.device
     nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
-    first = np.concatenate([[0], np.cumsum(PER_NODE * nodes if touching else np.ones_like(nodes))])
+    room = nodes * _per_node(model) if touching else np.ones_like(nodes)
+    first = np.concatenate([[0], np.cumsum(room)])
     total, cells, elements = int(first[-1]), model.cell_count, model.element_count
 
     def zeros(count: int, dtype: Any) -> wp.array:
@@ -254,6 +257,13 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
     c.at, c.at_other, c.gap = (zeros(total, p.real) for _ in range(3))
     c.normal = zeros(total, p.vec3)
     return c
+
+
+def _per_node(model: DeviceModel) -> np.ndarray:
+    """Contacts per node that a cell has room for, one more with the body, shape [C]."""
+    flagella = np.diff(model.data.first_flagellum.numpy())
+    near = np.full_like(flagella, NEAREST) if model.switches.self_contact else np.minimum(flagella - 1, NEAREST)
+    return np.maximum(LEAST_PER_NODE, np.ceil(PER_NEIGHBOUR * near).astype(int) + 1)
 
 
 def act(model: DeviceModel, state: DeviceState, contacts: Any, magnitude: wp.array) -> None:

@@ -122,8 +122,8 @@ def kernels(p: Precision) -> SimpleNamespace:
     Balance, counted = balance.struct(p), balance.functions(p).count
     theta_inside, whole_up_to = wp.constant(wp.float64(THETA)), wp.constant(wp.float64(BEGUN_WHOLE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
-    unsolved, inaccurate, unbalanced = (
-        wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE)
+    unsolved, crowded, inaccurate, unbalanced = (
+        wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.CROWDED, Fault.ACCURACY, Fault.BALANCE)
     )
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
 
@@ -319,7 +319,8 @@ def kernels(p: Precision) -> SimpleNamespace:
         elif dt > smallest:
             control.fault[c] = no_fault
         elif control.fault[c] == no_fault:
-            control.fault[c] = wp.where(kept, unsolved, unbalanced)
+            failed = wp.where(contacts_in.overflow[c] != 0, crowded, unsolved)
+            control.fault[c] = wp.where(kept, failed, unbalanced)
 
     @wp.kernel(module=module)
     def keep_elements(

@@ -38,10 +38,11 @@ OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth
 # The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
 # approaches the eigenvalue from below.
 LARGEST_FALL = 0.985
-MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
+MOST = 9.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.79 of a stiff mode after a step
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST, the limit of stability: from there on the full mobility is solved with
-LARGE_KAPPA_OF_FLEXIBLE = 3.7  # the same for flexible cells: eight flagella reach 3.5
+# The same for flexible cells: beyond it the over-implicitness can't follow kappa.
+LARGE_KAPPA_OF_FLEXIBLE = MOST / OVER_IMPLICIT_PER_KAPPA
 # First root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4).
 FREE_ROD = 4.730041
 RELAXED = 0.1  # decay times of that mode in a step from which a cell counts as stiff
@@ -134,16 +135,15 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     )
 
     @wp.func(module=module)
-    def rod_like(stability: Stability, c: wp.int32, step: wp.float64):
-        """Whether the longest bending mode of some flagellum relaxes within some ten steps."""
-        return step * stability.bending_rate[c] > relaxed
+    def flexible_in(stability: Stability, c: wp.int32, step: wp.float64):
+        """Whether no flagellum's longest mode of bending or of stretching is stiff in such steps."""
+        return step * stability.bending_rate[c] <= relaxed and step * stability.stretching_rate[c] <= tight
 
     @wp.func(module=module)
     def weakly_coupled(model: Model, stability: Stability, c: wp.int32, longest_step: wp.float64):
         """Whether kappa is small at any time: one or two flagella that are flexible in the longest step."""
         few = model.first_flagellum[c + 1] - model.first_flagellum[c] <= 2
-        taut = longest_step * stability.stretching_rate[c] > tight
-        return few and not rod_like(stability, c, longest_step) and not taut
+        return few and flexible_in(stability, c, longest_step)
 
     @wp.kernel(module=module)
     def schedule(
@@ -318,7 +318,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         if wp.isfinite(ratio) and ratio > wp.float64(0.0):
             weak = weakly_coupled(model, stability, c, longest_step[c])
             crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
-            flexible = weak or (crowd and not rod_like(stability, c, step[c]))
+            flexible = weak or (crowd and flexible_in(stability, c, step[c]))
             # The growth of a probe of any direction may exceed kappa by far: stiff cells are solved with the full
             # mobility until their probe has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]

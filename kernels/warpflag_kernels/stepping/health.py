@@ -44,6 +44,7 @@ class Fault(IntEnum):
     ACCURACY = 7
     BALANCE = 8
     UNSTABLE = 9
+    CROWDED = 10
 
 
 def encode(kind: Fault) -> int:

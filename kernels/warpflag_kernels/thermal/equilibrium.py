@@ -43,7 +43,7 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
     theta, gap_tolerance = wp.constant(wp.float64(IMPLICITNESS)), wp.constant(real(GAP_TOLERANCE))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault = wp.constant(wp.int32(NO_FAULT))
-    unsolved = wp.constant(wp.int32(encode(Fault.UNSOLVED)))
+    unsolved, crowded = (wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.CROWDED))
     module = p.module("equilibrium", "explicit" if explicit else "")
 
     @wp.kernel(module=module)
@@ -140,6 +140,8 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
         chart.commit[c] = 0
         if control.fault[c] == no_fault:
             control.fault[c] = unsolved
+            if wp.static(not explicit) and contacts_in.overflow[c] != 0:
+                control.fault[c] = crowded
 
     @wp.kernel(module=module)
     def finish(
