@@ -241,37 +241,43 @@ def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
             strayed = real(2.0) * farthest(model, guard.strayed, c) + touch
             as_contact = strayed < listed_reach * model.steric.diameter[c]
         shifted = real(2.0) * farthest(model, guard.shifted, c) + touch
-        if as_contact or shifted < contact_reach * model.steric.diameter[c] + skin:
-            i = first_later(model, near, e)
-            stop = candidates(model, near, e)
-            if as_contact:
-                i = listed.start[e]
-                stop = listed.stop[e]
-            while i < stop:
-                j = int(-1)
-                if as_contact:
-                    j = listed.other[i]
-                if not as_contact:
-                    j = candidate(model, near, e, i)
-                if j >= 0 and met(state, guard, e, j, moved, touch):
-                    wp.atomic_min(control.fault, c, crossing + e)
-                i += 1
-            return
+        as_neighbour = shifted < contact_reach * model.steric.diameter[c] + skin
+        i = first_later(model, near, e)
+        stop = candidates(model, near, e)
+        if as_contact:
+            i = listed.start[e]
+            stop = listed.stop[e]
+        # Else all segments later in the cell, but for those too far away.
         reach = real(0.5) * state.pose.length[e] + touch + real(2.0) * moved
-        other = k + 1
+        last = model.first_flagellum[c + 1]
+        other = k
+        following = e + 1
+        end = e + 1
         if wp.static(with_self):
-            other = k
-        while other < model.first_flagellum[c + 1]:
-            j = model.first_node[other] + 1
-            if wp.static(with_self) and other == k:
-                j = e + spacing(model, k, c)
-            end = model.first_node[other + 1]
-            while j < end:
-                if met(state, guard, e, j, moved, touch):
-                    wp.atomic_min(control.fault, c, crossing + e)
+            following = e + spacing(model, k, c)
+            end = model.first_node[k + 1]
+        going = bool(True)
+        while going:  # one loop for lists and all segments: the test of a pair, compiled once
+            j = int(-1)
+            if as_contact or as_neighbour:
+                going = i < stop
+                if going and as_contact:
+                    j = listed.other[i]
+                elif going:
+                    j = candidate(model, near, e, i)
+                i += 1
+            elif following < end:
+                j = following
                 away = wp.length(middle(state, e) - middle(state, j))
-                j = next_near(guard.longest[other], j, away, reach)
-            other += 1
+                following = next_near(guard.longest[other], j, away, reach)
+            else:
+                other += 1
+                going = other < last
+                if going:
+                    following = model.first_node[other] + 1
+                    end = model.first_node[other + 1]
+            if j >= 0 and met(state, guard, e, j, moved, touch):
+                wp.atomic_min(control.fault, c, crossing + e)
 
     @wp.kernel(module=module)
     def measure_moves(
