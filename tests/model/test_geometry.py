@@ -83,6 +83,19 @@ def test_a_scene_with_its_nodes_on_the_helix_is_at_rest(device):
 
 
 def test_segments_that_span_half_a_turn_are_refused():
+    for form in ("target", "second"):
+        forms = {"polymorphs.enabled": True, f"polymorphs.{form}": "curly_1"}
+        with pytest.raises(SceneError, match=r"span half a turn.*polymorphs\.curly_1.*flagella\.nodes_on_helix"):
+            cell(
+                {
+                    "flagella.nodes_on_helix": True,
+                    "flagella.segment_length": 0.7,
+                    "polymorphs.curly_1": (0, 3, 0),
+                    **forms,
+                }
+            )
+        with pytest.raises(SceneError, match=r"polymorphs\.curly_1 the frame turns by .* below pi"):
+            cell({"flagella.segment_length": 0.5, "polymorphs.curly_1": (0, 1, 7), **forms})
     with pytest.raises(SceneError, match=r"span half a turn.*flagella\.nodes_on_helix"):
         cell(
             {"flagella.nodes_on_helix": True, "flagella.segment_length": 1.0, "flagella.intrinsic_curvature": (0, 3, 0)}

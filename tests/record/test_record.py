@@ -77,6 +77,14 @@ def test_other_readers_open_a_record_that_was_read(tmp_path):
         np.testing.assert_array_equal(positions[4], frame(4).positions)
 
 
+def test_a_window_is_between_two_numbers(tmp_path):
+    record = Record(written(tmp_path / "run.h5", 5))
+    assert record.window(1e-4, 3e-4) == slice(1, 4)
+    for times in ((float("nan"), 3e-4), (1e-4, float("nan"))):
+        with pytest.raises(ValueError, match="nan"):
+            record.window(*times)
+
+
 def test_a_closed_record_sees_what_came_since(tmp_path):
     recorder = started(tmp_path / "run.h5")
     recorder.write(frame(0))
@@ -107,6 +115,7 @@ def test_mdanalysis_opens_it(tmp_path):
     [
         *(0, -1, slice(None), slice(3, 9), slice(-4, None), slice(2, 20, 5), slice(None, None, -2), slice(9, 3)),
         *(..., (slice(3, 9), 0), (4, slice(None), 2), (..., 2), [7, 2, 2], (slice(0, 4), [0, 3])),
+        *(None, (None, 4), ([7, 2], [0, 3]), ([7, 2], 3), (np.arange(23) > 20, [4, 4]), [[1, 2], [3, 4]], (3, [1, 0])),
     ],
     ids=str,
 )

@@ -159,6 +159,25 @@ def test_resume_needs_a_record_of_the_same_flagella(tmp_path):
         assert_holds_frames(record, range(3))
 
 
+@pytest.mark.parametrize("closed", [False, True], ids=["same start", "started again"])
+def test_a_record_takes_no_frame_twice_and_none_of_before(tmp_path, closed):
+    recorder = started(tmp_path / "run.h5")
+    for index in range(4):
+        recorder.write(frame(index))
+    if closed:
+        recorder.close()
+        recorder = started(tmp_path / "run.h5", resume_step=frame(3).step)
+    for index in (3, 1):
+        with pytest.raises(ValueError, match="does not come after the last frame"):
+            recorder.write(frame(index))
+    with pytest.raises(ValueError, match="does not come after"):
+        recorder.write(dataclasses.replace(frame(4), time=float("nan")))
+    recorder.write(frame(4))
+    recorder.close()
+    with Record(tmp_path) as record:
+        assert_holds_frames(record, range(5))
+
+
 def test_a_record_that_is_closed_between_blocks(tmp_path):
     """So many can be written that they can't all be open; only full blocks and flushes are committed."""
     now, files = [0.0], len(os.listdir("/dev/fd"))

@@ -129,3 +129,29 @@ def test_a_batch_needs_the_same_terms_and_stepper(device):
     for other in ({"steric.enabled": False}, {"numerics.stepper": "euler"}, {"flagella.count": 1}):
         with pytest.raises(SceneError):
             Simulation([cell(), cell(other)], device=device)
+
+
+@pytest.mark.parametrize("first", ["float64", "float32"])
+def test_a_batch_has_one_precision(first):
+    """The kernels of one would compute the other."""
+    scenes = [cell({"numerics.precision": own}) for own in sorted(["float64", "float32"], reverse=first == "float64")]
+    with pytest.raises(SceneError, match=r"numerics\.precision.*same in every scene"):
+        Simulation(scenes, device="cpu")
+
+
+def test_a_simulation_has_a_scene():
+    with pytest.raises(ValueError, match="one scene at least"):
+        Simulation([], device="cpu")
+
+
+def test_cells_are_counted_from_the_end_too(device):
+    batch = Simulation([cell(), cell({"flagella.count": 3})], device=device)
+    for last, same in ((-1, 1), (-2, 0)):
+        np.testing.assert_array_equal(batch.cell_state(last).positions, batch.cell_state(same).positions)
+        forces = [batch.evaluate(own).forces for own in (last, same)]
+        np.testing.assert_array_equal(*forces)
+    for beyond in (2, -3):
+        with pytest.raises(IndexError):
+            batch.cell_state(beyond)
+        with pytest.raises(IndexError):
+            batch.evaluate(beyond)

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from warpflag.run import member, run
 from warpflag.run.checkpoint import CheckpointError
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop, wall_seconds
+from warpflag.run.sweep.table import status_of
 from warpflag.scene import SceneError, dumps, load
 
 
@@ -144,6 +146,36 @@ def test_a_finished_run_says_that_it_is_done(tmp_path):
     outcome = run.resume(str(directory)).execute(quiet=True)
     assert outcome.status == "done" and "done already" in outcome.message
     assert (directory / "run.h5").read_bytes() == before
+
+
+def test_a_finished_run_whose_record_is_gone_is_computed_again(tmp_path):
+    whole, emptied = executed(small(), tmp_path / "whole"), executed(small(), tmp_path / "emptied")
+    (emptied / "run.h5").unlink()
+    outcome = run.resume(str(emptied)).execute(quiet=True)
+    assert outcome.status == "done" and "done already" not in outcome.message
+    assert_same_frames(whole, emptied)
+
+
+def test_a_finished_run_with_a_shorter_record_is_not_done(tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    with h5py.File(directory / "run.h5", "r+") as file:
+        file["particles/flagella/position/step"].resize((4,))
+    with pytest.raises(CheckpointError, match="none belongs to a frame of its record"):
+        run.resume(str(directory))
+
+
+@pytest.mark.parametrize("name", ["summary.json", "checkpoint"])
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(name, tmp_path):
+    directory = executed(small(), tmp_path / "made")
+    for path in directory.glob(f"{name}*"):
+        path.unlink()
+        os.mkfifo(path)
+    if name == "checkpoint":
+        with pytest.raises(CheckpointError, match="can be read"):
+            run.resume(str(directory), ["duration=1.6e-4"])
+    else:
+        assert status_of(directory) == "begun"
+        assert run.resume(str(directory)).execute(quiet=True).status == "done"
 
 
 def test_a_full_disk_fails_a_run_in_one_line_and_it_resumes(tmp_path, monkeypatch):

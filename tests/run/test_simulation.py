@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.runs import assert_same_frames, ended_at, executed, frame_by_frame, small
-from warpflag.record import Frame, Record
+from warpflag.record import Frame, Record, RecordError
 from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter
 from warpflag.run import run
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import SceneError
+from warpflag.scene import SceneError, loads
 
 STEPPERS = {
     "rkc": {"numerics.stepper": "rkc"},
@@ -52,7 +52,7 @@ def test_a_restored_simulation_goes_on_with_the_same_bits(values, device):
 
 def test_a_checkpoint_of_other_cells_is_refused():
     kept = Simulation(small(), device="cpu").checkpoint()
-    for values in ({"flagella.length": 2.4}, {"numerics.stepper": "rkc"}):
+    for values in ({"flagella.length": 2.4}, {"numerics.stepper": "rkc"}, {"numerics.precision": "float32"}):
         with pytest.raises(ValueError, match="checkpoint is of"):
             Simulation(small(values), device="cpu").restore(kept)
 
@@ -181,6 +181,28 @@ def test_reporters_are_closed_when_a_guard_is_violated():
 def test_a_run_takes_a_time_from_zero_on(duration):
     with pytest.raises(ValueError, match="a time from 0 on"):
         Simulation(small(), device="cpu").run(duration)
+
+
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), float("-inf")])
+def test_a_time_to_reach_is_finite(time):
+    simulation = Simulation(small(), device="cpu")
+    for reach in (simulation.advance, lambda until: next(simulation.frame_blocks(until))):
+        with pytest.raises(ValueError, match="finite"):
+            reach(time)
+
+
+@pytest.mark.parametrize("reached", [0.0, 4e-5])
+def test_a_recorder_keeps_to_one_scene_and_one_run(tmp_path, reached):
+    recorder = Recorder(tmp_path / "run.h5")
+    Simulation(small(), device="cpu", reporters=[recorder]).run(4e-5)
+    other = Simulation(small({"motor.torque": 2.0}), device="cpu", reporters=[recorder])
+    other.advance(reached)
+    with pytest.raises(RecordError, match="another scene"):
+        other.run(4e-5)
+    with pytest.raises(ValueError, match="does not come after"):
+        Simulation(small(), device="cpu", reporters=[recorder]).run(4e-5)
+    with Record(tmp_path / "run.h5") as record:
+        assert len(record.times) == 5 and loads(record.scene_text) == small()
 
 
 def test_a_batch_has_no_reporters_but_runs():

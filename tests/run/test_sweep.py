@@ -16,12 +16,14 @@ import pytest
 
 import warpflag
 from tests.runs import arrays, assert_same_frames, executed, small, summary
+from warpflag.base.output import OutputError
 from warpflag.record import Record
 from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
 from warpflag.run.stop import Stop
 from warpflag.run.sweep import Sweep, batches
 from warpflag.run.sweep.pool import Pool
+from warpflag.run.sweep.table import status_of
 from warpflag.scene import dumps
 
 BASE = {"duration": 4e-5, "frames": 4, "flagella.length": 1.0}
@@ -236,6 +238,31 @@ def test_a_finished_member_of_another_scene_is_refused(tmp_path):
     file.write_text(text.replace("3.0]", "3.0, 3.4]"))  # one more at the end is a longer sweep
     assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
     assert [row["motor.torque"] for row in rows(tmp_path / "out")] == ["1.0", "2.0", "3.0", "3.4"]
+
+
+def test_the_summary_of_another_member_is_none(tmp_path):
+    """Copied over a member's own it would give that row the numbers of its neighbour."""
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    table = (tmp_path / "out" / "table.csv").read_bytes()
+    other = (tmp_path / "out" / "0002" / "summary.json").read_text()
+    (tmp_path / "out" / "0001" / "summary.json").write_text(other)
+    assert status_of(tmp_path / "out" / "0001") == "begun"
+    sweep.resume(tmp_path / "out").execute(workers=1, quiet=True)
+    assert (tmp_path / "out" / "table.csv").read_bytes() == table
+
+
+@pytest.mark.parametrize("name", ["sweep.toml", "base.toml"])
+def test_a_sweep_whose_files_hold_no_text_is_refused(tmp_path, name):
+    plan = Sweep(small(BASE), {"motor.torque": TORQUES})
+    sweep.start(plan, str(tmp_path / "out"))
+    (tmp_path / "out" / name).write_bytes(b"\xe9")
+    with pytest.raises(OutputError, match=f"{name}: is not a text file"):
+        sweep.resume_or_start(plan, str(tmp_path / "out"))
+    (tmp_path / "out" / name).unlink()
+    os.mkfifo(tmp_path / "out" / name)
+    with pytest.raises(OutputError, match=f"{name}: can't be read: it is no file"):
+        sweep.resume_or_start(plan, str(tmp_path / "out"))
 
 
 def test_an_odd_summary_does_not_end_the_table(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import pickle
 import subprocess
@@ -376,3 +377,20 @@ def test_a_file_without_a_format_has_the_paper_s_model_and_says_so_once(tmp_path
     for made in (scene, Scene("x")):
         assert "\nformat = 1 " in dumps(made) and loads(dumps(made)) == made
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("motor", 5),
+        ("motor", sections.Hook()),
+        ("external", sections.Start()),
+        ("flagellum", "ab"),
+        ("flagellum", None),
+        ("flagellum", (1,)),
+    ],
+    ids=str,
+)
+def test_a_section_from_python_is_of_its_own_kind(name, value):
+    with pytest.raises(SceneError, match=rf"^{name} = .* must be a"):
+        dataclasses.replace(Scene(name="a"), **{name: value})

@@ -97,6 +97,12 @@ def test_what_can_t_be_shown_is_told(record, tmp_path):
     with pytest.raises(OutputError, match="phase_difference"):
         write_page(record, tmp_path / "page.html", color_by="mood")
     assert list(tmp_path.iterdir()) == []
+    shutil.copy(record.path, tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5", "r+") as file:  # of a version without checksums
+        del file["checksums"]
+        file["particles/flagella/position/value"][3] = np.nan
+    with pytest.raises(OutputError, match="not finite"):
+        page_of(Record(tmp_path))
 
 
 def test_a_scene_s_text_can_not_break_the_page(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -122,6 +124,38 @@ def test_the_command_draws_what_it_was_asked_for(line, grid, tmp_path, capsys):
     assert cli.main(["plot", str(line / "table.csv"), "-o", str(tmp_path / "x.png")]) == 2  # one of runs/sweep/*
     said = capsys.readouterr().err
     assert f"warpflag plot {line};" in said and f"warpflag plot {line}/0*" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("table.csv", lambda text: text[:-30], r"line \d+ has \d+ entries, not \d+ as the first"),
+        ("table.csv", lambda text: text + b"\n", r"has 0 entries"),
+        ("table.csv", lambda text: text + b"x" * 200_000, "field larger"),
+        ("table.csv", lambda text: text + b"\xe9", "UTF-8"),
+        ("table.csv", None, "is no file"),
+        ("sweep.toml", lambda text: b"axes = [1]", "axes is no table"),
+        ("sweep.toml", None, "is no file"),
+    ],
+)
+def test_a_damaged_table_is_refused_in_one_line(line, name, change, words):
+    path = line / name
+    text = path.read_bytes()
+    path.unlink()
+    os.mkfifo(path) if change is None else path.write_bytes(change(text))
+    with pytest.raises(OutputError, match=words) as caught:
+        sweep_figures.read(line)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_not_finite_is_not_drawn(line):
+    path = line / "table.csv"
+    header, first, rest = path.read_text().split("\n", 2)
+    values = first.split(",")
+    values[header.split(",").index("rates.net_speed")] = "inf"
+    path.write_text("\n".join([header, ",".join(values), rest]))
+    assert np.isnan(sweep_figures.read(line).numbers("rates.net_speed")[0])
+    assert sweep_figures.figure([line]) is not None
 
 
 def test_an_empty_or_missing_table_is_refused(line):

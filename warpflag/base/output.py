@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = ["DiskError", "OutputError", "machine_error", "missing", "sync_file_systems", "whole"]
+__all__ = ["DiskError", "OutputError", "machine_error", "missing", "sync_file_systems", "text_of_file", "whole"]
 
 
 class OutputError(ValueError):
@@ -37,6 +37,22 @@ class DiskError(OSError):
         else:
             reason = " ".join(str(error).split())
         return cls(f"{path}: can't be written: {reason}")
+
+
+def text_of_file(path: Path) -> str:
+    """What a text file holds.
+
+    Raises:
+        OutputError: it is no file, or holds no text. A pipe would be waited for.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path}: can't be read: it is no file")
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: can't be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise OutputError(f"{path}: is not a text file in UTF-8") from None
 
 
 @contextlib.contextmanager

@@ -34,7 +34,12 @@ def plan_of(scenes: Sequence[Scene], device: Any, strict: bool = False) -> Plan:
         scenes: one per cell.
         device: Warp's device.
         strict: kernels without reassociation or contraction, for comparisons to the last bit.
+
+    Raises:
+        ValueError: there is no scene.
     """
+    if not scenes:
+        raise ValueError("a simulation is of one scene at least")
     precision = Precision(scenes[0].numerics.precision, strict)
     moving = [sum(spec.segment_count for spec in scene.resolved_flagella()) for scene in scenes]
     return choose_plan(device, precision, switches_of(scenes[0]), max(moving))
@@ -48,9 +53,11 @@ def build_model(scenes: Sequence[Scene], plan: Plan) -> DeviceModel:
         plan: how they are executed.
 
     Raises:
-        SceneError: the scenes of a batch do not share the same switches.
+        SceneError: the scenes of a batch do not share the same switches and precision.
     """
-    switches = switches_of(scenes[0])
+    switches, precisions = switches_of(scenes[0]), {scene.numerics.precision for scene in scenes}
+    if len(precisions) > 1:
+        raise SceneError("numerics.precision", sorted(precisions), "must be the same in every scene of a batch")
     for scene in scenes[1:]:
         if switches_of(scene) != switches:
             raise SceneError(None, None, f"{scene.name}: a batch needs the same terms in every scene")

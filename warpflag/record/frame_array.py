@@ -68,9 +68,12 @@ class FrameArray:
         return self.shape[0]
 
     def __getitem__(self, key: Any) -> NDArray[np.float64]:
+        first: Any
         first, *rest = key if isinstance(key, tuple) else (key,)
         if first is Ellipsis:
             first, rest = slice(None), [Ellipsis, *rest]
+        if first is None or isinstance(first, bool | np.bool_):  # adds an axis before the frames
+            return self[:][key]
         rows = np.arange(len(self))[first]  # IndexError and negative steps as in any array
         if rows.size == 0:
             return np.empty(self.shape)[key]
@@ -80,7 +83,9 @@ class FrameArray:
             if len(block) != int(rows.max()) + 1 - low:
                 raise RecordError(f"{self._path}: is damaged: /{self._name} ends before frame {int(rows.max())}")
         self._verify(block, low)
-        return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
+        if isinstance(first, slice) or not rows.ndim:
+            return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
+        return block[(rows - low, *rest)]  # frames by an array go together with other arrays, one by one
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[:], dtype=dtype)

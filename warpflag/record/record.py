@@ -235,7 +235,12 @@ class Record:
         Args:
             start: [s]; default: after two thirds of the recorded time.
             stop: [s]; default: the last frame.
+
+        Raises:
+            ValueError: a time is no number.
         """
+        if start != start or stop != stop:
+            raise ValueError(f"a window is between two times, not {start} and {stop}")
         times = self.times
         start = times[0] + 2 / 3 * (times[-1] - times[0]) if start is None else start
         stop = times[-1] if stop is None else stop

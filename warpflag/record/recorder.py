@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import shutil
 import time
@@ -79,13 +80,14 @@ class Recorder:
         self._file: Any = None
         self._disk: DiskFile | None = None
         self._parameters: dict[str, Any] = {}
+        self._recorded = ""  # the scene of the frames that this recorder has taken
         self._datasets: dict[str, Rows] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._summed: list[str] = []  # entries in the order of their checksums
         self._committed, self._synced = 0, False
         self._pending: list[dict[str, Any]] = []
         self._last_commit = float("-inf")  # so that the first frame is late
-        self._last_step = resume_step
+        self._last_step, self._last_time = resume_step, -math.inf
 
     @property
     def frame_count(self) -> int:
@@ -117,6 +119,8 @@ class Recorder:
                 written by another run.
             DiskError: the file could not be written; it is as it was.
         """
+        if self._recorded not in ("", scene_text):
+            raise RecordError(f"{self.path}: holds frames of another scene, and a record is of one")
         self._parameters = {
             "scene": scene_text,
             "scene_sha256": hashlib.sha256(scene_text.encode()).hexdigest(),
@@ -135,11 +139,10 @@ class Recorder:
         """Appends a frame; its arrays are copied.
 
         Raises:
-            ValueError: its shapes or observables are not those of the record.
+            ValueError: its shapes or observables are not those of the record, or it does not come after the last frame.
             DiskError: a block of frames could not be written; all committed before stay readable.
         """
         values = values_of(frame)
-        self._last_step = frame.step
         shapes = {name: value.shape for name, value in values.items()}
         if not (self._started or self._pending):
             self._refuse_existing()
@@ -151,7 +154,12 @@ class Recorder:
             expected = {name: shape for name, shape in known.items() if name != CHECKSUMS}
             wrong = sorted(name for name, _ in shapes.items() ^ expected.items())
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
+        last = float(self._pending[-1]["time"]) if self._pending else self._last_time
+        if not frame.time > last:
+            told = f"a frame of {frame.time:g} s does not come after the last frame of {self.path}, {last:g} s"
+            raise ValueError(f"{told}: a record is of one run")
         self._pending.append(values)
+        self._last_step, self._recorded = frame.step, self._parameters["scene"]
         late = self._keep_open and not (self._started and self._clock() - self._last_commit <= _BLOCK_SECONDS)
         if late or len(self._pending) >= self._block_frames:
             self._commit()
@@ -218,6 +226,7 @@ class Recorder:
         self._first_rows = first if not self._keep_open and count < self._block_frames else {}
         self._keep(rows, count)
         self._committed, self._pending, self._last_commit = count, [], self._clock()
+        self._last_time = float(rows["time"][-1])
         if not self._keep_open:
             self._release()
 
@@ -324,6 +333,7 @@ class Recorder:
             if not np.array_equal(present["first_node"], self._parameters["first_node"]):
                 raise RecordError(f"{self.path}: has other flagella than the run that would continue it")
             self._committed = int(np.searchsorted(record.steps, resume_step, side="right"))
+            self._last_time = record.times[self._committed - 1] if self._committed else -math.inf
             names = list(record.entries)
         disk = DiskFile(self.path)
         if parameters_checksum(present) != parameters_checksum(self._parameters):

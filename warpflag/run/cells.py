@@ -56,7 +56,8 @@ class Cells:
     first_node: np.ndarray
 
     def flagella(self, cell: int) -> slice:
-        """The flagella of one cell."""
+        """The flagella of one cell; a negative index counts from the end."""
+        cell = range(len(self.time))[cell]
         return slice(int(self.first_flagellum[cell]), int(self.first_flagellum[cell + 1]))
 
     def nodes(self, cell: int) -> slice:

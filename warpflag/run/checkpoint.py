@@ -108,6 +108,8 @@ def load(
     """
     numbered, readable = _numbered(Path(directory)), 0
     for _, path in reversed(numbered):
+        if not path.is_file():  # a pipe would be waited for
+            continue
         try:
             with np.load(path, allow_pickle=False) as data:
                 meta = json.loads(str(data["meta"]))

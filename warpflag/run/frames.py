@@ -5,6 +5,7 @@ Frames are taken on the device, inside steps (`warpflag_kernels.stepping.dense_o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,12 +22,23 @@ from warpflag.run.cells import Cells, motor_torques
 from warpflag.scene import Scene
 from warpflag.stepping import Stepper, System
 
-__all__ = ["Frames"]
+__all__ = ["Frames", "finite_time"]
 
 _NEVER = 1e9  # [s]; finite, since fixed steps divide what is left of the time
 _ROUNDING = 1e-6  # of a frame interval: times this close are the same
 # What rates are differences of; it is kept of the last frame of every cell.
 _MOTION = ("time", "body_position", "body_orientation", "body_angle", "motor_angle")
+
+
+def finite_time(time: float) -> float:
+    """A simulated time to reach [s]: one that is no number would end nothing, and one without end never comes.
+
+    Raises:
+        ValueError: the time is not finite.
+    """
+    if not math.isfinite(found := float(time)):
+        raise ValueError(f"a time to reach is finite, not {time}")
+    return found
 
 
 @dataclass(frozen=True)

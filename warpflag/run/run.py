@@ -6,7 +6,6 @@ checkpoint with the numbers of a run that was never stopped.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,18 +15,18 @@ import numpy as np
 from warpflag import __version__
 from warpflag.base.streams import tell
 from warpflag.model.start import shape_of_frame
-from warpflag.record import RECORD_NAME, Record
+from warpflag.record import RECORD_NAME, Record, RecordError
 from warpflag.run import checkpoint
 from warpflag.run.execute import Run
 from warpflag.run.lock import Lock
 from warpflag.run.member import Member, Outcome
 from warpflag.run.run_directory import (
     SCENE_NAME,
-    SUMMARY_NAME,
     RunError,
     claim_directory,
     is_of_scene,
     recorded_scene,
+    summary_of,
     write_whole,
 )
 from warpflag.run.simulation import Simulation
@@ -35,6 +34,10 @@ from warpflag.scene import Scene, SceneError, with_values
 from warpflag.scene.scene_file import read_overrides
 
 __all__ = ["Outcome", "Run", "begun_at_checkpoint", "resume", "resume_batch", "start", "start_batch"]
+
+# What is said of a checkpoint, and in which arrays it stands as well.
+_META = {"step": int, "time": float, "wall_time": float, "device": str, "versions": dict}
+_REPEATED = {"step": "control.steps", "time": "frame.time"}
 
 
 def start(scene: Scene, output: str | None = None, device: str | None = None, **options: Any) -> Run:
@@ -186,22 +189,33 @@ def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[s
     """The latest checkpoint whose frame the record holds."""
     with Record(path) as record:
         times, texts = record.times, [(path / SCENE_NAME).read_text(encoding="utf-8"), record.scene_text]
-    arrays, meta = checkpoint.load(path, lambda meta: bool((np.abs(times - meta["time"]) <= 1e-12 * times[-1]).any()))
+
+    def fits(meta: Any) -> bool:
+        if not isinstance(meta, dict) or not all(isinstance(meta.get(name), kind) for name, kind in _META.items()):
+            return False
+        return bool((np.abs(times - meta["time"]) <= 1e-12 * abs(meta["time"])).any())
+
+    arrays, meta = checkpoint.load(path, fits)
+    if any(meta[name] != arrays.get(array, np.zeros(0)).ravel()[:1] for name, array in _REPEATED.items()):
+        raise RunError(f"--resume {path}: its checkpoint is of another step than it says")
     if not is_of_scene(meta, scene, texts):
         raise RunError(f"--resume {path}: its checkpoint is of another scene than {SCENE_NAME}")
     if scene.duration < meta["time"] * (1 - 1e-9):
         problem = f"must not be below {meta['time']:g} s, where the run stands"
         raise SceneError("duration", scene.duration, problem, source=f"--resume {path}")
-    if (written := meta["versions"]["warpflag"]) != __version__:
+    if (written := meta["versions"].get("warpflag")) != __version__:
         tell(f"{path} was written by version {written}, this is {__version__}")
     return arrays, meta
 
 
 def _is_done(path: Path, scene: Scene) -> bool:
+    """Whether the summary says so, and the record is there to its end."""
+    summary = summary_of(path)
+    if summary.get("status") != "done" or summary.get("duration") != scene.duration:
+        return False
     try:
-        summary = json.loads((path / SUMMARY_NAME).read_text(encoding="utf-8"))
-        return summary["status"] == "done" and summary["duration"] == scene.duration
-    except (OSError, ValueError, KeyError, TypeError):
+        return bool(Record(path).times[-1] >= scene.duration * (1 - 1e-9))
+    except (RecordError, IndexError):
         return False
 
 

@@ -7,6 +7,7 @@ import errno
 import functools
 import hashlib
 import itertools
+import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -28,6 +29,7 @@ __all__ = [
     "recorded_scene",
     "settings_of",
     "settings_sha256",
+    "summary_of",
     "write_whole",
 ]
 
@@ -87,6 +89,19 @@ def write_whole(path: Path, text: str) -> None:
     """Writes a text file that is whole or absent."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def summary_of(directory: Path) -> dict[str, Any]:
+    """The summary of a run directory; empty where there is none, or one of another scene than the directory's."""
+    path = directory / SUMMARY_NAME
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        if not isinstance(summary, dict):
+            return {}
+        own = summary.get("scene_sha256")  # versions before this one did not write it
+        return summary if own is None or own == _sha256((directory / SCENE_NAME).read_text(encoding="utf-8")) else {}
+    except (OSError, ValueError, RecursionError):
+        return {}
 
 
 def settings_sha256(scene: Scene, text: str | None = None, defaults: str | None = None) -> str:

@@ -28,7 +28,7 @@ from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, hand_over
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
-from warpflag.run.frames import Frames
+from warpflag.run.frames import Frames, finite_time
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 
@@ -87,8 +87,7 @@ class Simulation:
         self._first_flagellum = model.data.first_flagellum.numpy()
         self.reporters = list(reporters)
         self._capture, self._graph = capture, None
-        self._checked, self._loaded = False, False
-        self._passes_per_replay = 200
+        self._checked, self._loaded, self._passes_per_replay = False, False, 200
         self._frames = Frames(self.system, self.scenes)
         self._reader = CellsReader(self.system)
         self._excluded = np.zeros(len(self.scenes), dtype=bool)
@@ -174,9 +173,10 @@ class Simulation:
             watch: as in `advance`.
 
         Returns:
-            An iterator over blocks: the next frame of each cell that has one, by cell; then those after them; and so
-            on. A block may be empty, since the host also looks a few times a second.
+            An iterator over blocks: the next frame of each cell that has one, by cell; then those after them. A block
+            may be empty, since the host also looks a few times a second.
         """
+        until = None if until is None else finite_time(until)
         self.prepare(recording=True)
         if (self._frames.index < 0).all():
             yield self._frames.first(self._present_state())
@@ -249,8 +249,9 @@ class Simulation:
 
         Raises:
             NumericalError: a guard was violated; the device holds the offending state, frames taken before are sound.
+            ValueError: the time is not finite.
         """
-        self._advance(np.full(len(self.scenes), float(until)), watch)
+        self._advance(np.full(len(self.scenes), finite_time(until)), watch)
         self._frames.pass_by(self.times)
         self._raise_fault()
 
@@ -317,20 +318,18 @@ class Simulation:
         Raises:
             ValueError: the arrays are of another simulation.
         """
-        carried = self.system.carried()
-        parts = {
-            part: {name.partition(".")[2]: x for name, x in arrays.items() if name.startswith(f"{part}.")}
-            for part in ("stepper", "frame")
-        }
+        parts: dict[str, dict[str, np.ndarray]] = {"stepper": {}, "frame": {}}
+        for name, x in arrays.items():
+            parts.get(name.partition(".")[0], {})[name.partition(".")[2]] = x
         if "before_position" in parts["frame"] and not self._frames.taken:
             self._take_frames()
-        own = {"stepper": self.stepper.memory(), "frame": self._frames.memory()}
-        same = all(parts[part].keys() == own[part].keys() for part in own)
-        if not same or len(carried) + sum(map(len, own.values())) != len(arrays):
+        own = self.checkpoint()
+        if own.keys() != arrays.keys():
             raise ValueError("the checkpoint is of another version or another stepper")
-        for name, array in carried.items():
-            if array.numpy().shape != arrays[name].shape:
-                raise ValueError(f"the checkpoint is of other cells: {name} has the shape {arrays[name].shape}")
+        for name, then in arrays.items():
+            if (then.shape, then.dtype) != (own[name].shape, own[name].dtype):
+                raise ValueError(f"the checkpoint is of other cells: {name} has shape {then.shape}, type {then.dtype}")
+        for name, array in self.system.carried().items():
             array.assign(arrays[name])
         self.stepper.restart()
         self.stepper.recall(parts["stepper"])
@@ -357,7 +356,8 @@ class Simulation:
         return evaluation_of(self.system, self.scenes[cell], *self._own(cell))
 
     def _own(self, cell: int) -> tuple[slice, slice]:
-        """The flagella and the nodes of one cell."""
+        """The flagella and the nodes of one cell; a negative index counts from the end."""
+        cell = range(len(self.scenes))[cell]
         flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
         return flagella, slice(self.first_node[flagella.start], self.first_node[flagella.stop])
 

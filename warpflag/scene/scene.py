@@ -106,6 +106,7 @@ class Scene(Section, key=""):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._check_sections()
         object.__setattr__(self, "flagellum", tuple(self.flagellum))
         problems = Problems()
         for check in (
@@ -151,6 +152,16 @@ class Scene(Section, key=""):
                 )
             )
         return tuple(specs)
+
+    def _check_sections(self) -> None:
+        """Every section is of its own kind, which a file can't get wrong but Python can."""
+        for field in dataclasses.fields(self):
+            value, kind = getattr(self, field.name), field.default_factory
+            if isinstance(kind, type) and not isinstance(value, kind):
+                raise SceneError(field.name, repr(value), f"must be a {kind.__name__}")
+        own = self.flagellum
+        if not isinstance(own, list | tuple) or not all(isinstance(one, FlagellumOverride) for one in own):
+            raise SceneError("flagellum", repr(own), "must be a sequence of FlagellumOverride, one per flagellum")
 
     def _check_body(self) -> None:
         if not self.body.enabled:
@@ -314,17 +325,22 @@ class Scene(Section, key=""):
         if not 2 <= spec.segment_count <= 10_000:
             problem = f"makes {spec.segment_count} of {spec.length:g} um; 2 to 10000 segments are allowed"
             raise SceneError(key, value, problem, lengths)
-        try:
-            strain = self.flagella.strain_at_rest(spec.segment_length)
-        except ValueError as error:
-            raise SceneError(key, value, f"{error}, with flagella.nodes_on_helix", lengths) from None
-        twist = spec.segment_length * abs(strain[2])
-        if twist >= math.pi:
-            problem = (
-                f"makes segments of {spec.segment_length:g} um; with flagella.intrinsic_curvature the frame "
-                f"turns by {twist:.3g} rad from one to the next, which must be below pi"
-            )
-            raise SceneError(key, value, problem, [*lengths, "flagella.intrinsic_curvature"])
+        forms: dict[str, tuple[float, float, float] | None] = {"flagella.intrinsic_curvature": None}
+        names = (self.polymorphs.target, self.polymorphs.second) if self.polymorphs.enabled else ()
+        forms |= {f"polymorphs.{name}": getattr(self.polymorphs, name) for name in names if name != "none"}
+        for form, own in forms.items():
+            try:
+                strain = self.flagella.strain_at_rest(spec.segment_length, own)
+            except ValueError as error:
+                of = f" of {form}" if own else ""
+                raise SceneError(key, value, f"{error}{of}, with flagella.nodes_on_helix", [*lengths, form]) from None
+            twist = spec.segment_length * abs(strain[2])
+            if twist >= math.pi:
+                problem = (
+                    f"makes segments of {spec.segment_length:g} um; with {form} the frame "
+                    f"turns by {twist:.3g} rad from one to the next, which must be below pi"
+                )
+                raise SceneError(key, value, problem, [*lengths, form])
 
     def _check_anchor(self, k: int, spec: FlagellumSpec) -> None:
         pole = self.body.length / 2

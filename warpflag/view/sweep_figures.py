@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpflag.base.output import OutputError, missing
+from warpflag.base.output import OutputError, missing, text_of_file
 from warpflag.observables.arrays import Array
 from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
 
@@ -63,15 +63,16 @@ class Table:
     columns: dict[str, list[str]]
 
     def numbers(self, name: str) -> Array:
-        """A column as numbers, NaN where it is empty, shape [row_count].
+        """A column as numbers, NaN where it is empty or not finite, shape [row_count].
 
         Raises:
             OutputError: there is no such column, or it does not hold numbers.
         """
         try:
-            return np.array([float(text) if text else math.nan for text in self.columns[self.full_name(name)]])
+            found = np.array([float(text) if text else math.nan for text in self.columns[self.full_name(name)]])
         except ValueError:
             raise OutputError(f"{self.name}: column {name} does not hold numbers") from None
+        return np.where(np.isfinite(found), found, math.nan)
 
     def full_name(self, name: str) -> str:
         """The column of a name, which may be the last part of one alone: net_speed for rates.net_speed.
@@ -125,13 +126,19 @@ def read(directory: str | Path) -> Table:
     """
     path = Path(directory) / "table.csv"
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            header, *rows = csv.reader(file)
-        axes = tomllib.loads((Path(directory) / "sweep.toml").read_text(encoding="utf-8")).get("axes", {})
-    except (OSError, ValueError) as error:
+        header, *rows = csv.reader(text_of_file(path).splitlines(), strict=True)
+        axes = tomllib.loads(text_of_file(path.with_name("sweep.toml"))).get("axes", {})
+    except OutputError:
+        raise
+    except (ValueError, RecursionError, csv.Error) as error:
         raise OutputError(f"{path}: can't be read: {' '.join(str(error).split())}") from None
     if not rows:
         raise OutputError(f"{path}: has no rows")
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise OutputError(f"{path}: line {number} has {len(row)} entries, not {len(header)} as the first line")
+    if not isinstance(axes, dict):
+        raise OutputError(f"{path.with_name('sweep.toml')}: axes is no table of values by key")
     columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
     return Table(Path(directory).resolve().name, tuple(key for key in axes if key in columns), columns)
 

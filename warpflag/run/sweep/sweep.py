@@ -12,6 +12,7 @@ from typing import Any
 
 from warpflag.base.device import cores, find_device, start_warp
 from warpflag.base.forked import Starter
+from warpflag.base.output import text_of_file
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
 from warpflag.model.starts import Starts
@@ -289,14 +290,14 @@ def resume_or_start(sweep: Sweep, output: str) -> SweepRun:
     """The sweep of a directory, which must be the same, or a new one there.
 
     Raises:
+        OutputError: its files can't be read.
         RunError: the directory holds another sweep.
         BadMembers, LockedError, SceneError: as in `start`.
     """
     path = Path(output)
     if not (path / SWEEP_NAME).exists():
         return start(sweep, output)
-    text = (path / SWEEP_NAME).read_text(encoding="utf-8") + (path / BASE_NAME).read_text(encoding="utf-8")
-    if text != sweep.dumps() + sweep.base_text():
+    if text_of_file(path / SWEEP_NAME) + text_of_file(path / BASE_NAME) != sweep.dumps() + sweep.base_text():
         raise RunError(f"-o {output}: holds another sweep")
     return resume(path)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,22 +11,13 @@ from typing import Any
 import numpy as np
 
 from warpflag.base.output import whole
-from warpflag.run.run_directory import SCENE_NAME, SUMMARY_NAME
+from warpflag.run.run_directory import SCENE_NAME, summary_of
 
-__all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "summary_of", "write"]
+__all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "write"]
 
 TABLE_NAME, MEANS_NAME, HDF5_NAME = "table.csv", "means.csv", "table.h5"
 # Of a summary; what the machine took for it is no result.
 _NUMBERS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events", "behaviour")
-
-
-def summary_of(directory: Path) -> dict[str, Any]:
-    """The summary of a run directory; empty where there is none."""
-    try:
-        summary = json.loads((directory / SUMMARY_NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def status_of(directory: Path) -> str:
