@@ -10,12 +10,14 @@ import os
 import re
 import shutil
 
+import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
 import pytest
 
 from tests.films import FIRST_NODE, THREE, made_record
 from warpflag import cli
 from warpflag.base.output import OutputError
+from warpflag.record import Record
 from warpflag.scene import paper_scene, with_values
 from warpflag.view.coloring import Coloring
 from warpflag.view.page import page_of, write_page
