@@ -104,7 +104,7 @@ def test_a_scene_that_starts_from_a_record_has_the_forms_of_its_frame(tmp_path, 
     assert abs(forms(sim).sum() - kept.sum()) <= 2  # the front is where it was
 
 
-REAL_HOOK = {"hook.stiffness": 0.65, "hydrodynamics.mode": "consistent", "polymorphs.ramp": 1e-3}
+REAL_HOOK = {"hook.stiffness": 0.65, "hydrodynamics.mode": "consistent", "polymorphs.ramp": None}
 
 
 @pytest.mark.parametrize("torque, expected", [(1.05, 0.0), (1.26, 0.72), (3.4, 0.90)])
@@ -115,10 +115,25 @@ def test_a_front_of_semicoiled_form_runs_as_far_as_the_moment_allows(torque, exp
     assert np.abs(np.diff(found)).sum() == (expected > 0.0)
 
 
+@pytest.mark.parametrize("speed", [200.0, 400.0])
+def test_a_front_travels_at_the_speed_of_the_scene_whatever_the_segment_length(speed, device):
+    """Over 1.5 um, looked at every 0.05 ms; less what steps add, since a joint changes where one has ended."""
+    for h in (0.2, 0.1):
+        values = {**REAL_HOOK, "polymorphs.front_speed": speed, "flagella.segment_length": h}
+        sim = Simulation(cell({**HELD, "motor.torque": -3.4, **values}), device=device)
+        times, lengths = [], []
+        for length in (1.5, 3.0):
+            while h * forms(sim).sum() < length:
+                sim.advance(float(sim.times[0]) + 5e-5)
+            times.append(float(sim.times[0]))
+            lengths.append(h * forms(sim).sum())
+        assert 0.85 * speed < np.diff(lengths)[0] / np.diff(times)[0] < 1.03 * speed
+
+
 def test_a_fast_front_stops_after_one_turn_of_the_new_form_where_the_filament_has_a_kink(device):
     """Whatever the length: after 1.72 um, from where on the outer part stands across the axis; to 0.5 um."""
     for length in (6.0, 10.0):
-        found = grown(-1.26, device, 3e-2, **{**REAL_HOOK, "polymorphs.ramp": 2e-4, "flagella.length": length})
+        found = grown(-1.26, device, 3e-2, **{**REAL_HOOK, "polymorphs.front_speed": 1e3, "flagella.length": length})
         assert abs(0.2 * found.sum() - 2 * np.pi / np.linalg.norm(SEMICOILED)) < 0.5
 
 

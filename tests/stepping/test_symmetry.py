@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.helpers import evaluated, matrix, moved_rigidly, rotation, shaken, touching_cell
 from tests.oracles import CUTOFF, contact_distances
@@ -18,7 +19,10 @@ TURN, FAR = np.array([0.7, -1.1, 0.4]), np.array([1000.0, -600.0, 300.0])  # rad
 MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
-def cell_in_contact(precision: str) -> tuple[Scene, InitialState]:
+FLOW = {"hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": True}
+
+
+def cell_in_contact(precision: str, more: dict[str, object] | None = None) -> tuple[Scene, InitialState]:
     # Explicit Euler has no stage count that could differ between the two runs; float32 would lose its tiny steps.
     stepper = {"float64": ("euler", 4e-9), "float32": ("rkc", 2e-7)}[precision]
     values = {
@@ -27,6 +31,7 @@ def cell_in_contact(precision: str) -> tuple[Scene, InitialState]:
         # Out of phase: the closest points of segments that are all but parallel hang on their last digits.
         "flagellum.0.phase": 180.0,
         "flagellum.1.phase": 176.5,
+        **(more or {}),
     }
     scene = touching_cell(values, precision, separation=0.06)
     start = shaken(scene, seed=14, node=0.002, spin=0.05)
@@ -78,8 +83,10 @@ def test_forces_and_velocities_turn_with_the_cell(precision, device):
         assert close(getattr(there, name), getattr(here, name), precision), name
 
 
-def test_forces_and_velocities_are_mirrored(precision, device):
-    scene, start = cell_in_contact(precision)
+@pytest.mark.parametrize("more", [{}, FLOW])
+def test_forces_and_velocities_are_mirrored(more, precision, device):
+    """With flow round the body, too, whose beads have no hand."""
+    scene, start = cell_in_contact(precision, more)
     right = evaluated(scene, start, device)
     left = evaluated(mirrored_scene(scene), mirrored(start), device)
     for name in ("forces", "velocities", "body_force", "body_velocity"):
@@ -108,8 +115,9 @@ def test_run_turned_and_far_away(precision, device):
         assert np.abs(found - expected).max() < PLACES[precision]
 
 
-def test_mirrored_run(precision, device):
-    scene, start = cell_in_contact(precision)
+@pytest.mark.parametrize("more", [{}, FLOW])
+def test_mirrored_run(more, precision, device):
+    scene, start = cell_in_contact(precision, more)
     left = run(scene, start, device)
     right = run(mirrored_scene(scene), mirrored(start), device)
     x, y, z, w = left.body_orientation

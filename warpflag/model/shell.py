@@ -1,7 +1,8 @@
 """The shell of beads that stands for the cell body in the flow: where its beads lie, how large they are, its matrices.
 
-Beads sit on an area-uniform spiral over a spheroid a little inside the body's, and are so large and so far inside that
-the shell, moved as a rigid body, has the drags of the spheroid: along its axis and across, about it and across.
+Beads sit in rings on a spheroid a little inside the body's, and are so large and so far inside that the shell, moved as
+a rigid body, has the drags of the spheroid: along its axis and across, about it and across. The shell is its own mirror
+image, as the body is, so that it drives nothing round.
 Three numbers, the radius and the two depths, are fitted to four drags at set-up, by least squares; the shape of the
 body and the number of beads determine them.
 """
@@ -23,9 +24,9 @@ __all__ = ["BodyShell", "body_shell", "rotne_prager", "shell_mobility", "shells_
 
 LARGEST_ERROR = 0.01
 """Largest error of a drag that a fit may leave; the body of the default scene has 0.004 with 30 to 480 beads."""
-_ITERATIONS = 12  # of the fit, at most: bodies of aspect 1 to 7 with 30 to 480 beads take 4 to 11
+_ITERATIONS = 12  # of the fit, at most: bodies of aspect 1 to 10 with 60 to 240 beads take 4 to 7
 _DIGITS = 4  # of radius and depths over the half width: the same beads on every machine
-_GOLDEN = math.pi * (3 - math.sqrt(5))  # golden angle [rad]: turned by it, points of a spiral lie most evenly
+_HEXAGONAL = math.sqrt(3) / 2  # distance of rows over that of points in a row, of points packed most evenly
 
 
 @dataclass(frozen=True)
@@ -73,17 +74,55 @@ def rotne_prager(x: np.ndarray, a: float | np.ndarray, y: np.ndarray, b: float |
     return tensor.transpose(0, 2, 1, 3)
 
 
-def _spiral(count: int, long: float, wide: float) -> np.ndarray:
-    """Points on a prolate spheroid with these semi-axes, long along z: turned by the golden angle from one to the next,
-    each with the same share of the area."""
-    squared = max(1 - (wide / long) ** 2, 1e-12)
-    e = math.sqrt(squared)
-    t = np.linspace(-1, 1, 4001)
-    area = t * np.sqrt(1 - squared * t * t) + np.arcsin(e * t) / e  # up to the height t, over what is common
-    share = (np.arange(count) + 0.5) / count
-    height = np.interp(share, (area - area[0]) / (area[-1] - area[0]), t)
-    angle, across = _GOLDEN * np.arange(count), wide * np.sqrt(1 - height**2)
-    return np.stack([across * np.cos(angle), across * np.sin(angle), long * height], axis=1)
+def _ring_counts(count: int, long: float, wide: float) -> tuple[tuple[int, ...], ...]:
+    """Beads of each ring round a prolate spheroid from pole to pole, in the order in which they are to be tried.
+
+    Rings lie as densely along the surface as beads on them, in a hexagonal pattern, and hold beads as their
+    circumferences. There is an odd number of rings, as many beads in one as in its mirror image.
+    """
+    heights, lengths = _meridian(long, wide)
+    spacing = math.sqrt(_HEXAGONAL * _area(long, wide) / count)
+    wanted = 2 * round((lengths[-1] / spacing - 1) / 2) + 1
+    found = []
+    for rings in (wanted, wanted + 2, wanted - 2):
+        least = 3 if 3 * rings <= count else 2
+        rings = max(1, min(rings, 2 * ((count // least - 1) // 2) + 1))
+        round_each = np.sqrt(1 - np.interp(_middles(rings), lengths / lengths[-1], heights) ** 2)
+        half = rings // 2
+        counts = np.full(half + 1, least)
+        counts[half] += (count - least) % 2
+        while (left := count - counts[half] - 2 * counts[:half].sum()) > 0:
+            ring = int(np.argmin((counts + 1) / round_each[: half + 1]))
+            counts[ring] += min(left, 2) if ring == half else 1
+        found.append((*map(int, counts), *map(int, counts[half - 1 :: -1] if half else ())))
+    return tuple(dict.fromkeys(found))
+
+
+def _meridian(long: float, wide: float) -> tuple[np.ndarray, np.ndarray]:
+    """Heights over the long semi-axis of points on a spheroid from pole to pole, and the way to them [um]."""
+    angle = np.linspace(0.0, math.pi, 2001)
+    steps = np.hypot(long * np.diff(np.cos(angle)), wide * np.diff(np.sin(angle)))
+    return -np.cos(angle), np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _middles(count: int) -> np.ndarray:
+    return (np.arange(count) + 0.5) / count
+
+
+def _rings(counts: tuple[int, ...], long: float, wide: float) -> np.ndarray:
+    """Points on a prolate spheroid with these semi-axes, long along z: rings at equal distances along the surface.
+
+    Every second ring is turned by half the angle between its points. Together they are their own mirror images in the
+    plane across y and, as long as the rings are, in that across z.
+    """
+    heights, lengths = _meridian(long, wide)
+    height = np.interp(_middles(len(counts)), lengths / lengths[-1], heights)
+    points = []
+    for ring, (count, z) in enumerate(zip(counts, height, strict=True)):
+        turned = 0.5 * ((ring - len(counts) // 2) % 2)
+        angle, across = 2 * math.pi * (np.arange(count) + turned) / count, wide * math.sqrt(1 - z * z)
+        points.append(np.stack([across * np.cos(angle), across * np.sin(angle), np.full(count, long * z)], axis=1))
+    return np.concatenate(points)
 
 
 def _rigid_motion(x: np.ndarray) -> np.ndarray:
@@ -95,33 +134,28 @@ def _rigid_motion(x: np.ndarray) -> np.ndarray:
     return k
 
 
-def _assembled(count: int, long: float, wide: float, radius: float, depths: np.ndarray) -> tuple:
-    """Points, M_c, M_c^-1 K and K^T M_c^-1 K of one choice of radius and depths."""
-    x = _spiral(count, long - depths[0], wide - depths[1])
+def _assembled(counts: tuple[int, ...], long: float, wide: float, radius: float, depths: np.ndarray) -> tuple:
+    """Points, M_c, M_c^-1 K and K^T M_c^-1 K of one choice of rings, radius and depths."""
+    x, count = _rings(counts, long - depths[0], wide - depths[1]), sum(counts)
     mobility = rotne_prager(x, radius, x, radius).reshape(3 * count, 3 * count)
     k = _rigid_motion(x).reshape(3 * count, 6)
     rigid = np.linalg.solve(mobility, k)
     return x, mobility, rigid, k.T @ rigid
 
 
-@functools.cache
-def body_shell(length: float, width: float, count: int) -> BodyShell:
-    """The fitted shell of a body.
+def _fit(counts: tuple[int, ...], length: float, width: float) -> tuple[float, np.ndarray]:
+    """Radius of the beads and depths of their spheroid over the half width of the body, by least squares.
 
-    Args:
-        length, width: of the body [um].
-        count: of beads.
-
-    Raises:
-        SceneError: so many beads can't have the drags of this body.
+    Returns:
+        the largest relative error that they leave of a drag of the body; the three numbers.
     """
-    long, wide = length / 2, width / 2
+    long, wide, count = length / 2, width / 2, sum(counts)
     exact = spheroid_mobility(length, width, 1 / (8 * math.pi))
     wanted = 1 / np.array([exact.along, exact.across, exact.spin, exact.tumble])
 
     def errors(numbers: np.ndarray) -> np.ndarray:
         """Relative errors of the four drags, across the axis the mean of both directions."""
-        r = np.diagonal(_assembled(count, long, wide, wide * numbers[0], wide * numbers[1:])[3])
+        r = np.diagonal(_assembled(counts, long, wide, wide * numbers[0], wide * numbers[1:])[3])
         return np.array([r[2], (r[0] + r[1]) / 2, r[5], (r[3] + r[4]) / 2]) / wanted - 1
 
     # Start: beads that cover the surface, a third of a radius inside; Gauss-Newton with halved steps where needed.
@@ -146,11 +180,31 @@ def body_shell(length: float, width: float, count: int) -> BodyShell:
         if moved < 10**-_DIGITS / 5:
             break
     numbers = np.round(numbers, _DIGITS)
-    worst = float(np.abs(errors(numbers)).max())
+    return float(np.abs(errors(numbers)).max()), numbers
+
+
+@functools.cache
+def body_shell(length: float, width: float, count: int) -> BodyShell:
+    """The fitted shell of a body.
+
+    Args:
+        length, width: of the body [um].
+        count: of beads.
+
+    Raises:
+        SceneError: so many beads can't have the drags of this body.
+    """
+    long, wide = length / 2, width / 2
+    fits = []
+    for counts in _ring_counts(count, long, wide):
+        fits.append((*_fit(counts, length, width), counts))
+        if fits[-1][0] < LARGEST_ERROR / 2:
+            break
+    worst, numbers, counts = min(fits, key=lambda fit: fit[0])
     if worst > LARGEST_ERROR:
         problem = f"leaves a drag of the body off by {100 * worst:.2g} %; more beads fit a body that is so long"
         raise SceneError("hydrodynamics.body_beads", count, problem, ["body.length", "body.width"])
-    x, mobility, rigid, resistance = _assembled(count, long, wide, wide * numbers[0], wide * numbers[1:])
+    x, mobility, rigid, resistance = _assembled(counts, long, wide, wide * numbers[0], wide * numbers[1:])
     inverse = np.linalg.inv(mobility)
     inverse = (inverse + inverse.T) / 2
     return BodyShell(

@@ -119,7 +119,8 @@ def _fill_polymorphs(scenes: Sequence[Scene], precision: Any, device: Any, data:
     forms = [scene.polymorphs for scene, _, _ in specs]
     m, pairs = parts.polymorphs, functools.partial(wp.array, dtype=wp.vec2d, device=device)
     m.rest_strain = wp.array(strains, dtype=precision.vec3, device=device)
-    m.ramp = wp.array([f.ramp for f in forms], dtype=wp.float64, device=device)
+    ramps = [f.ramp or spec.segment_length / f.front_speed for f, (_, _, spec) in zip(forms, specs, strict=True)]
+    m.ramp = wp.array(ramps, dtype=wp.float64, device=device)
     m.nucleation = pairs(np.array([(f.nucleation, -f.nucleation_back) for f in forms]))
     m.propagation = pairs(np.array([(f.propagation, f.propagation_back) for f in forms]))
     tables = [second_intervals(scene, k) for scene, k, _ in specs]

@@ -212,9 +212,9 @@ class Polymorphs(Section, key="polymorphs"):
 
     Rate of going on to the second form: that to curly-1 in models built on Mears et al., eLife 3, e01916 (2014).
     Moments are about the helix axis, against the handedness of the ground state, as a reversed motor winds it up.
-    Thresholds of nucleation: Hotani, J. Mol. Biol. 156, 791 (1982). Those of propagation lie on both sides of the
-    middle of these two, which is a choice. Strains of the target: from pitch and radius, semicoiled and curly-1 with
-    half the pitch of the normal form (Darnton & Berg, Biophys. J. 92, 2230 (2007)).
+    Thresholds of nucleation: Hotani, J. Mol. Biol. 156, 791 (1982). Those of propagation, on both sides of the middle
+    of these two, are a choice. Strains of the target: from pitch and radius, semicoiled and curly-1 with half the
+    pitch of the normal form (Darnton & Berg, Biophys. J. 92, 2230 (2007)).
     """
 
     enabled: bool = switch(False, "joints flip between the ground state and the target")
@@ -230,7 +230,8 @@ class Polymorphs(Section, key="polymorphs"):
     nucleation_back: float = number(0.4, "pN um", -1e3, 1e3, "moment the other way at which it flips back")
     propagation: float = number(0.4, "pN um", -1e3, 1e3, "moment at which a joint beside the target flips to it")
     propagation_back: float = number(0.3, "pN um", -1e3, 1e3, "moment below which one beside the other form flips back")
-    ramp: float = number(1e-3, "s", 1e-6, 1, "time in which the ground state of a joint changes")
+    front_speed: float = number(200.0, "um/s", 1, 1e5, "at which a change of form travels along the filament, at most")
+    ramp: float | None = number(None, "s", 1e-6, 1, "in which a joint's ground state changes", derived="h/front_speed")
 
 
 @dataclass(frozen=True)
