@@ -38,11 +38,11 @@ OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth
 # The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
 # approaches the eigenvalue from below.
 LARGEST_FALL = 0.985
-MOST = 9.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.79 of a stiff mode after a step
+MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST, the limit of stability: from there on the full mobility is solved with
-# The same for flexible cells: beyond it the over-implicitness can't follow kappa.
-LARGE_KAPPA_OF_FLEXIBLE = MOST / OVER_IMPLICIT_PER_KAPPA
+# The same for flexible cells, whose kappa is a growth: readings up to 13 amid contacts are of sound steps.
+LARGE_KAPPA_OF_FLEXIBLE = 15.0
 # First root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4).
 FREE_ROD = 4.730041
 RELAXED = 0.1  # decay times of that mode in a step from which a cell counts as stiff
@@ -328,10 +328,12 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
             if stability.strong[c] != 0:
                 stability.any_strong[0] = 1
-            if flexible and stability.strong[c] == 0:
-                over_implicit[c] = wp.clamp(share * kappa, wp.max(least, fall * over_implicit[c]), most)
-            else:
-                over_implicit[c] = least
+            w = least
+            if flexible:
+                w = wp.max(least, fall * over_implicit[c])
+                if stability.strong[c] == 0:
+                    w = wp.clamp(share * kappa, w, most)
+            over_implicit[c] = w
             stability.kappa[c] = kappa
             scale = real(wp.float64(1.0) / ratio)
             stability.probe.body[c] = scale * response.body[c]
