@@ -2,6 +2,6 @@
 
 import sys
 
-from warpflag.cli import main
+from warpflag.cli import command
 
-sys.exit(main())
+sys.exit(command())

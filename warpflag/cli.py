@@ -8,6 +8,7 @@ Everything heavy is imported by the command that needs it.
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
     from warpflag.scene import Scene
 
-__all__ = ["main"]
+__all__ = ["command", "main"]
 
 _STATUS = {"done": DONE, "failed": FAILED, "stopped": STOPPED, "interrupted": INTERRUPTED, "terminated": TERMINATED}
 
@@ -31,6 +32,13 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(BAD_INPUT, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def command() -> int:
+    """The process of the command line: `main`, and a quick end; returns its exit status."""
+    status = main()
+    gc.freeze()  # or Python looks for garbage among all that Warp has defined, a fifth of a second
+    return status
 
 
 @protected_streams()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 __all__ = ["MOST_PROBLEMS", "Problems", "SceneError", "shown", "written"]
@@ -69,21 +69,25 @@ class SceneError(ValueError):
 
 
 class Problems:
-    """Gathers what is wrong with a scene, so that all of it is told at once."""
+    """Gathers what is wrong with a scene, so that all of it is told at once: what is raised in `with` blocks of it."""
 
     def __init__(self) -> None:
         self._errors: list[SceneError] = []
         self._count = 0
 
-    @contextlib.contextmanager
-    def gathered(self) -> Iterator[None]:
+    def __enter__(self) -> Problems:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
         """Keeps a SceneError of the block instead of passing it on."""
-        try:
-            yield
-        except SceneError as error:
-            self._count += 1 + len(error.others)
-            if len(self._errors) < MOST_PROBLEMS:
-                self._errors.append(error)
+        if not isinstance(error, SceneError):
+            return False
+        self._count += 1 + len(error.others)
+        if len(self._errors) < MOST_PROBLEMS:
+            self._errors.append(error)
+        return True
 
     def full(self) -> bool:
         """Whether there are so many that further ones are not told."""

@@ -129,7 +129,7 @@ def _built(values: Mapping[str, Any], tables: int) -> Scene:
     own: dict[int, dict[str, Any]] = {}
     sections: dict[str, dict[str, Any]] = {key: {} for key in ("", *_SECTIONS)}
     for key, value in values.items():
-        with problems.gathered():
+        with problems:
             check_key(key, value, problems.full())
             section, _, name = key.rpartition(".")
             if section in sections:
@@ -140,7 +140,7 @@ def _built(values: Mapping[str, Any], tables: int) -> Scene:
         sections["flagella"].setdefault("count", tables)
     built: dict[str, Any] = {}
     for key, cls in _SECTIONS.items():
-        with problems.gathered():
+        with problems:
             built[key] = cls(**sections[key])
     count = tables
     if own and not tables:
@@ -148,14 +148,14 @@ def _built(values: Mapping[str, Any], tables: int) -> Scene:
     for k in own:
         if k >= count:
             name, value = next(iter(own[k].items()))
-            with problems.gathered():
+            with problems:
                 raise SceneError(f"flagellum.{k}.{name}", value, f"there are flagella 0 to {count - 1}")
     overrides = []
     for k in range(min(count, int(Flagella.settings["count"].high)) if not problems.full() else 0):
-        with problems.gathered():
+        with problems:
             overrides.append(_override(k, own.get(k, {})))
     for name, setting in Scene.settings.items():
-        with problems.gathered():
+        with problems:
             if name in sections[""]:
                 setting.checked(name, sections[""][name])
             elif name == "name":

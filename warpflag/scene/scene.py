@@ -119,10 +119,10 @@ class Scene(Section, key=""):
             self._check_forms,
             self._check_noise,
         ):
-            with problems.gathered():
+            with problems:
                 check()
         self._check_flagella(problems)
-        with problems.gathered():
+        with problems:
             self._check_phases()
         problems.raise_any()
 
@@ -271,7 +271,7 @@ class Scene(Section, key=""):
     def _check_flagella(self, problems: Problems) -> None:
         if self.flagellum and len(self.flagellum) != self.flagella.count:
             problem = f"must be {len(self.flagellum)}, the number of [[flagellum]] tables, or absent"
-            with problems.gathered():
+            with problems:
                 raise SceneError("flagella.count", self.flagella.count, problem)
             return
         told: set[str | None] = set()  # a value of the group is at fault once, not for every flagellum
@@ -284,10 +284,10 @@ class Scene(Section, key=""):
                 except SceneError as error:
                     if error.key not in told:
                         told.add(error.key)
-                        with problems.gathered():
+                        with problems:
                             raise
         if self.steric.enabled and not any(key and key.endswith("anchor_offset") for key in told):
-            with problems.gathered():
+            with problems:
                 self._check_distances()
 
     def _check_distances(self) -> None:

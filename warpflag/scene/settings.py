@@ -217,7 +217,7 @@ class Section:
         prefix = f"{self.key}." if self.key else ""
         problems = Problems()
         for name, setting in self.settings.items():
-            with problems.gathered():
+            with problems:
                 # The instance is frozen, but not yet finished.
                 object.__setattr__(self, name, setting.checked(prefix + name, getattr(self, name)))
         problems.raise_any()

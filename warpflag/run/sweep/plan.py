@@ -154,8 +154,8 @@ class Sweep:
             for repeat in range(repeats):
                 number = f"{point * repeats + repeat:0{width}d}"
                 try:
-                    values, scene = self._varied(random, combination, draw, repeat)
-                    scene = with_values(scene, {"name": f"{self.base.name}-{number}"})
+                    name = f"{self.base.name}-{number}"
+                    values, scene = self._varied(random, combination, draw, repeat, name)
                 except SceneError as error:
                     bad[f"member {number}"] = error
                     continue
@@ -164,20 +164,22 @@ class Sweep:
         return members
 
     def _varied(
-        self, random: draws.Draws, combination: Sequence[Any], draw: int, repeat: int
+        self, random: draws.Draws, combination: Sequence[Any], draw: int, repeat: int, name: str
     ) -> tuple[dict[str, Any], Scene]:
         """The values of one member by dotted key, and its scene."""
-        axes = dict(zip(self.axes, combination, strict=True))
-        drawn = random.values(with_values(self.base, axes), draw, repeat)
+        axes, named = dict(zip(self.axes, combination, strict=True)), {"name": name}
+        scene = with_values(self.base, axes | named)
+        drawn = random.values(scene, draw, repeat)
         for key in axes.keys() & drawn.keys():
             raise SceneError(f"axes.{key}", list(self.axes[key]), "is drawn at random, too: leave out one of both")
         values = axes | drawn
-        return values, with_values(self.base, values)
+        return values, with_values(self.base, values | named) if drawn else scene
 
     def first_scene(self) -> Scene | None:
         """That of the first member, without a look at the others; None where it can't be simulated."""
         with contextlib.suppress(SceneError, IndexError):
-            return self._varied(draws.Draws(self.random, self.base), [v[0] for v in self.axes.values()], 0, 0)[1]
+            first = [values[0] for values in self.axes.values()]
+            return self._varied(draws.Draws(self.random, self.base), first, 0, 0, self.base.name)[1]
         return None
 
     def dumps(self) -> str:

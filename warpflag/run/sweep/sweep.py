@@ -164,7 +164,10 @@ class SweepRun:
                 for batch in self.batches_for(pool, pending, quiet, stop):
                     pool.submit(batch)
                 progress.update(0.0)
+                import h5py  # noqa: F401 (the table's, while this process has nothing else to do)
+
                 while not pool.is_done:
+                    pool.wait()
                     for batch, outcomes in pool.finished():
                         for k, outcome in zip(batch.members, outcomes, strict=True):
                             if outcome.status not in ("done", "interrupted", "terminated"):
@@ -177,7 +180,6 @@ class SweepRun:
                         self._write_table()
                         written = monotonic()
                     stop.check()
-                    pool.wait()
             except KeyboardInterrupt as error:
                 ended = error if isinstance(error, Ended) else Ended("interrupted", "")
                 pool.end(ended.status)
