@@ -49,6 +49,7 @@ __all__ = [
     "RECORD_NAME",
     "UNITS",
     "Frame",
+    "FrameRows",
     "RecordError",
     "checksums",
     "dataset_path",
@@ -117,6 +118,59 @@ class Frame:
     body_orientation: NDArray[np.floating]
     observables: dict[str, float | NDArray[np.floating]] = field(default_factory=dict)
     forms: NDArray[np.integer] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRows:
+    """Frames of one cell that follow each other: arrays of the numbers that a `Frame` has, frames first.
+
+    Attributes:
+        time, step: of each frame, shape [frame].
+        positions, directors, motor_angle, body_position, body_orientation, forms: as in `Frame`, shape [frame, ...].
+        observables: by name, shape [frame] or [frame, flagellum_count].
+    """
+
+    time: NDArray[np.floating]
+    step: NDArray[np.integer]
+    positions: NDArray[np.floating]
+    directors: NDArray[np.floating]
+    motor_angle: NDArray[np.floating]
+    body_position: NDArray[np.floating]
+    body_orientation: NDArray[np.floating]
+    observables: dict[str, NDArray[np.floating]]
+    forms: NDArray[np.integer] | None = None
+
+    @classmethod
+    def of(cls, frame: Frame) -> FrameRows:
+        """A frame alone."""
+        return cls(
+            time=np.array([frame.time]),
+            step=np.array([frame.step]),
+            positions=np.asarray(frame.positions)[None],
+            directors=np.asarray(frame.directors)[None],
+            motor_angle=np.asarray(frame.motor_angle)[None],
+            body_position=np.asarray(frame.body_position)[None],
+            body_orientation=np.asarray(frame.body_orientation)[None],
+            observables={name: np.asarray(value)[None] for name, value in frame.observables.items()},
+            forms=None if frame.forms is None else np.asarray(frame.forms)[None],
+        )
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def frame(self, row: int) -> Frame:
+        """One of them; its arrays are views."""
+        return Frame(
+            time=float(self.time[row]),
+            step=int(self.step[row]),
+            positions=self.positions[row],
+            directors=self.directors[row],
+            motor_angle=self.motor_angle[row],
+            body_position=self.body_position[row],
+            body_orientation=self.body_orientation[row],
+            observables={name: values[row] for name, values in self.observables.items()},
+            forms=None if self.forms is None else self.forms[row],
+        )
 
 
 def dataset_path(name: str) -> str:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
+import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from warpflag.base.output import DiskError
+from warpflag.record.disk import DiskFile
 from warpflag.record.layout import (
     BODY_ORIENTATION,
     BODY_POSITION,
@@ -19,19 +24,20 @@ from warpflag.record.layout import (
     MOTOR_ANGLE,
     POSITION,
     UNITS,
-    Frame,
+    FrameRows,
     dataset_path,
     parameters_checksum,
 )
 from warpflag.record.rows import Rows
 
-__all__ = ["FORMAT", "TEMPLATES", "add_parameters", "first_image", "growth", "values_of"]
+__all__ = ["FORMAT", "TEMPLATES", "first_image", "growth", "values_of", "with_new_parameters"]
 
 FORMAT = ("v108", "v108")
 """The format of HDF5 1.8, in which groups and headers of datasets have checksums. Later formats mark a file as open
 while it is written, and one whose writer was killed can't be opened again."""
 
-_CHUNK_BYTES = 1 << 20  # of a chunk, for 16 to 64 frames: HDF5's cache of chunks holds one
+_CHUNK_BYTES = 1 << 20  # of a chunk: HDF5's cache of chunks holds one
+_FRAMES_OF_CHUNK = (16, 64)  # at least and at most
 _NUMBERS = itertools.count()
 _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
@@ -41,22 +47,23 @@ TEMPLATES: dict[Any, _Template] = {}
 """Records that new ones of this process begin with, by what such records have in common."""
 
 
-def values_of(frame: Frame) -> dict[str, Any]:
-    """A copy of a frame by the names of its entries in the file."""
+def values_of(rows: FrameRows) -> dict[str, NDArray[Any]]:
+    """A copy of frames by the names of their entries in the file."""
     values = {
-        POSITION: frame.positions,
-        E1: frame.directors,
-        MOTOR_ANGLE: frame.motor_angle,
-        BODY_POSITION: frame.body_position,
-        BODY_ORIENTATION: frame.body_orientation,
-        "time": frame.time,
-        **{f"observables/{name}": value for name, value in frame.observables.items()},
+        POSITION: rows.positions,
+        E1: rows.directors,
+        MOTOR_ANGLE: rows.motor_angle,
+        BODY_POSITION: rows.body_position,
+        BODY_ORIENTATION: rows.body_orientation,
+        "time": rows.time,
+        **{f"observables/{name}": value for name, value in rows.observables.items()},
     }
-    found = {"step": np.int64(frame.step), **{name: np.array(v, dtype=np.float64) for name, v in values.items()}}
-    return found if frame.forms is None else {**found, FORM: np.array(frame.forms, dtype=np.int8)}
+    found = {"step": np.array(rows.step, dtype=np.int64)}
+    found |= {name: np.array(v, dtype=np.float64, order="C") for name, v in values.items()}
+    return found if rows.forms is None else {**found, FORM: np.array(rows.forms, dtype=np.int8, order="C")}
 
 
-def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> bytes:
+def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any], expected: int) -> bytes:
     """The bytes of a new record with its first frames.
 
     Records of cells that are alike differ in a few numbers: they are put in their places in the bytes of one that HDF5
@@ -65,6 +72,7 @@ def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any])
     Args:
         rows: of the frames, by entry, frames first, checksums among them.
         parameters: what /parameters holds.
+        expected: frames that it will hold: space is taken for no more, unless it gets more.
 
     Raises:
         ValueError: the frames have other nodes or flagella than the parameters say.
@@ -75,10 +83,11 @@ def first_image(rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any])
             raise ValueError(f"{name} of a frame has shape {rows[name].shape[1:]}, the scene's is {shape}")
     shapes = tuple((name, values.shape) for name, values in rows.items())
     kept = tuple((name, _stored(value).shape, _stored(value).dtype.str) for name, value in _plain(parameters).items())
-    key = (shapes, kept, tuple(parameters["versions"].items()))
+    most = int(np.clip(expected, *_FRAMES_OF_CHUNK))
+    key = (shapes, kept, tuple(parameters["versions"].items()), most)
     template = TEMPLATES.get(key)
     if template is None:
-        template = _Template.made(rows, parameters)
+        template = _Template.made(rows, parameters, most)
         if sum(len(other.image) for other in list(TEMPLATES.values())) > _TEMPLATE_BYTES:
             TEMPLATES.clear()
         TEMPLATES[key] = template
@@ -110,11 +119,11 @@ class _Template:
     parameters: dict[str, int]
 
     @classmethod
-    def made(cls, rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> _Template:
-        """That of records which have frames and parameters of these shapes."""
+    def made(cls, rows: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any], most: int) -> _Template:
+        """That of records which have frames and parameters of these shapes, and at most so many frames in a chunk."""
         with _in_memory() as file:
-            _fill(file, rows, parameters["versions"].get("warpflag", "unknown"))
-            add_parameters(file, parameters)
+            _fill(file, rows, parameters["versions"].get("warpflag", "unknown"), most)
+            _add_parameters(file, parameters)
             file.flush()
             found = {}
             for name in rows:
@@ -148,7 +157,7 @@ class _Template:
             return file.id.get_file_image()
 
 
-def _fill(file: Any, rows: Mapping[str, NDArray[Any]], version: str) -> None:
+def _fill(file: Any, rows: Mapping[str, NDArray[Any]], version: str, most: int) -> None:
     """Writes a record without /parameters into an empty file of HDF5."""
     file.create_group("h5md").attrs["version"] = np.array([1, 1], dtype=np.int32)
     file.create_group("h5md/author").attrs["name"] = _text("unknown")
@@ -161,7 +170,7 @@ def _fill(file: Any, rows: Mapping[str, NDArray[Any]], version: str) -> None:
     # The shared datasets first, under the entry that every record has.
     entries = ["step", "time", *(name for name in rows if name not in ("step", "time", CHECKSUMS))]
     for name in entries:
-        _add_dataset(file, name, rows[name])
+        _add_dataset(file, name, rows[name], most)
     file.create_group("h5md/modules/units").attrs["version"] = np.array([1, 0], dtype=np.int32)
     time: Any = file[dataset_path("time")]
     time.make_scale("time")
@@ -170,7 +179,7 @@ def _fill(file: Any, rows: Mapping[str, NDArray[Any]], version: str) -> None:
     for name in set(entries) - {"step", "time", POSITION}:
         file[f"{name}/step"] = file[dataset_path("step")]
         file[f"{name}/time"] = time
-    sums = _add_dataset(file, CHECKSUMS, rows[CHECKSUMS])
+    sums = _add_dataset(file, CHECKSUMS, rows[CHECKSUMS], most)
     sums.attrs["entries"] = np.array([_text(name) for name in rows if name != CHECKSUMS])
 
 
@@ -193,7 +202,7 @@ def _in_memory(image: bytes | None = None) -> Any:
     return h5py.File(h5f.open(name.encode(), h5f.ACC_RDWR, access))
 
 
-def add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
+def _add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
     """Writes /parameters, which must not be there yet, into an open file of HDF5."""
     group = file.create_group("parameters")
     for name, value in parameters.items():
@@ -202,6 +211,42 @@ def add_parameters(file: Any, parameters: Mapping[str, Any]) -> None:
         else:
             group[name] = _text(value) if isinstance(value, str) else value
     group.attrs["checksum"] = np.uint32(parameters_checksum(parameters))
+
+
+def with_new_parameters(disk: DiskFile, parameters: Mapping[str, Any]) -> DiskFile:
+    """Replaces a record by a copy with other parameters: they are changed all together or not at all.
+
+    Args:
+        disk: the record.
+        parameters: what /parameters is to hold.
+
+    Returns:
+        the copy, locked; `disk`, which was the file before, is closed.
+
+    Raises:
+        DiskError: there is no room for a copy; the file is as it was.
+    """
+    import h5py
+
+    temporary = disk.path.with_name(disk.path.name + ".tmp")
+    try:
+        shutil.copyfile(disk.path, temporary)
+        changed = DiskFile(temporary)
+        changed.reserve(os.path.getsize(temporary) + len(parameters["scene"]) + (1 << 16))
+        with h5py.File(temporary, "r+", locking=False, libver=FORMAT) as file:
+            del file["parameters"]
+            _add_parameters(file, parameters)
+        changed.sync()
+        os.replace(temporary, disk.path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, DiskError):
+            error = error.__cause__ or error
+        raise DiskError.of(disk.path, error) from None
+    finally:
+        disk.close()
+    return changed
 
 
 def growth(datasets: Iterable[Rows], before: int, after: int) -> int:
@@ -225,10 +270,10 @@ def growth(datasets: Iterable[Rows], before: int, after: int) -> int:
     return total
 
 
-def _add_dataset(file: Any, name: str, rows: NDArray[Any]) -> Any:
-    """A dataset of frames that begins with some, in chunks of 16 to 64 frames."""
+def _add_dataset(file: Any, name: str, rows: NDArray[Any], most: int) -> Any:
+    """A dataset of frames that begins with some, in chunks of at most so many frames."""
     shape = rows.shape[1:]
-    chunk = int(np.clip(_CHUNK_BYTES // max(1, rows[:1].nbytes), 16, 64))
+    chunk = int(np.clip(_CHUNK_BYTES // max(1, rows[:1].nbytes), _FRAMES_OF_CHUNK[0], most))
     return file.create_dataset(dataset_path(name), data=rows, maxshape=(None, *shape), chunks=(chunk, *shape))
 
 

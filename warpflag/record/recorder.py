@@ -12,7 +12,6 @@ import contextlib
 import hashlib
 import math
 import os
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -29,13 +28,14 @@ from warpflag.record.layout import (
     FORM,
     POSITION,
     Frame,
+    FrameRows,
     RecordError,
     checksums,
     one_line,
     parameters_checksum,
     summed_entries,
 )
-from warpflag.record.new_record import FORMAT, add_parameters, first_image, growth, values_of
+from warpflag.record.new_record import FORMAT, first_image, growth, values_of, with_new_parameters
 from warpflag.record.record import Record
 from warpflag.record.rows import Rows
 
@@ -57,6 +57,7 @@ class Recorder:
         block_frames: frames of a block.
         keep_open: whether the file stays open and locked between blocks. If not, only full blocks and calls of `flush`
             are committed, the first ones, too: thousands of records can then be written at once.
+        expected: frames that the record will hold; it may get more.
         clock: seconds that pass, for tests.
     """
 
@@ -67,12 +68,14 @@ class Recorder:
         resume_step: int | None = None,
         block_frames: int = 10,
         keep_open: bool = True,
+        expected: int = MOST_KEPT,
         most_kept: int = MOST_KEPT,
         clock: Callable[[], float] = time.monotonic,
     ):
         self.path = Path(path)
         self._resume_step = resume_step
         self._block_frames, self._keep_open, self._most_kept = block_frames, keep_open, most_kept
+        self._expected = expected
         self._clock = clock
         self._started = False  # the file is there, open or not
         self._first_rows: dict[str, NDArray[Any]] = {}  # all that is committed, while that is less than a block
@@ -85,14 +88,14 @@ class Recorder:
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._summed: list[str] = []  # entries in the order of their checksums
         self._committed, self._synced = 0, False
-        self._pending: list[dict[str, Any]] = []
+        self._pending: list[dict[str, NDArray[Any]]] = []
         self._last_commit = float("-inf")  # so that the first frame is late
         self._last_step, self._last_time = resume_step, -math.inf
 
     @property
     def frame_count(self) -> int:
         """Frames in the record so far, those not yet committed included: the index of the next frame."""
-        return self._committed + len(self._pending)
+        return self._committed + sum(len(values["step"]) for values in self._pending)
 
     def start(
         self,
@@ -136,33 +139,45 @@ class Recorder:
             self._refuse_existing()
 
     def write(self, frame: Frame) -> None:
-        """Appends a frame; its arrays are copied.
+        """Appends a frame; as `write_rows`."""
+        self.write_rows(FrameRows.of(frame))
+
+    def write_rows(self, rows: FrameRows) -> None:
+        """Appends frames; their arrays are copied.
 
         Raises:
-            ValueError: its shapes or observables are not those of the record, or it does not come after the last frame.
+            ValueError: their shapes or observables are not those of the record, or one does not come after the last.
             DiskError: a block of frames could not be written; all committed before stay readable.
         """
-        values = values_of(frame)
-        shapes = {name: value.shape for name, value in values.items()}
+        values, first = values_of(rows), 0
+        self._check(values)
+        while first < len(rows):
+            room = max(self._block_frames - (self.frame_count - self._committed), 1)
+            part = slice(first, first + room)
+            self._pending.append({name: value[part] for name, value in values.items()})
+            self._last_step, self._recorded = int(values["step"][part][-1]), self._parameters["scene"]
+            first += room
+            late = self._keep_open and not (self._started and self._clock() - self._last_commit <= _BLOCK_SECONDS)
+            if late or first <= len(rows):  # late, or a block is full
+                self._commit()
+
+    def _check(self, values: Mapping[str, NDArray[Any]]) -> None:
+        """That frames come after those before them, with the same shapes and entries; the first begin a new file."""
+        shapes = {name: value.shape[1:] for name, value in values.items()}
         if not (self._started or self._pending):
             self._refuse_existing()
         if not self._shapes:
             self._summed = list(values)
             self._shapes = {**shapes, CHECKSUMS: (len(values),)}
-        known = self._shapes
-        if len(shapes) + (CHECKSUMS in known) != len(known) or any(known.get(n) != s for n, s in shapes.items()):
-            expected = {name: shape for name, shape in known.items() if name != CHECKSUMS}
-            wrong = sorted(name for name, _ in shapes.items() ^ expected.items())
+        expected = {name: shape for name, shape in self._shapes.items() if name != CHECKSUMS}
+        if wrong := sorted({name for name, _ in shapes.items() ^ expected.items()}):
             raise ValueError(f"frame {self.frame_count} differs from the record in the shape or presence of {wrong}")
-        last = float(self._pending[-1]["time"]) if self._pending else self._last_time
-        if not frame.time > last:
-            told = f"a frame of {frame.time:g} s does not come after the last frame of {self.path}, {last:g} s"
-            raise ValueError(f"{told}: a record is of one run")
-        self._pending.append(values)
-        self._last_step, self._recorded = frame.step, self._parameters["scene"]
-        late = self._keep_open and not (self._started and self._clock() - self._last_commit <= _BLOCK_SECONDS)
-        if late or len(self._pending) >= self._block_frames:
-            self._commit()
+        last = float(self._pending[-1]["time"][-1]) if self._pending else self._last_time
+        for at in values["time"].tolist():
+            if not at > last:
+                told = f"a frame of {at:g} s does not come after the last frame of {self.path}, {last:g} s"
+                raise ValueError(f"{told}: a record is of one run")
+            last = at
 
     def flush(self, sync: bool = True) -> None:
         """Commits the frames that are pending: from here on they survive the end of this process and a power cut.
@@ -210,8 +225,8 @@ class Recorder:
             return
         # Rows start at the committed count, not at a dataset's end: a commit that was interrupted is
         # repeated.
-        count = self._committed + len(self._pending)
-        rows = {name: np.stack([values[name] for values in self._pending]) for name in self._pending[0]}
+        count = self.frame_count
+        rows = {name: np.concatenate([values[name] for values in self._pending]) for name in self._pending[0]}
         if CHECKSUMS in self._shapes:
             rows[CHECKSUMS] = np.stack([checksums(rows[name]) for name in self._summed], axis=1)
         if not self._started:
@@ -308,7 +323,7 @@ class Recorder:
         self._pending, self._shapes = [], {}  # nothing is kept of frames that can't be written
         if not self._started:
             self._refuse_existing()
-        image = first_image(rows, self._parameters)
+        image = first_image(rows, self._parameters, self._expected)
         temporary = self.path.with_name(self.path.name + ".tmp")
         try:
             with open(temporary, "wb") as file:
@@ -337,7 +352,7 @@ class Recorder:
             names = list(record.entries)
         disk = DiskFile(self.path)
         if parameters_checksum(present) != parameters_checksum(self._parameters):
-            disk = self._with_new_parameters(disk)
+            disk = with_new_parameters(disk, self._parameters)
         try:
             self._open(disk, names)
             for name in ["step", *(name for name in names if name != "step")]:  # at no moment is a dataset shorter
@@ -362,34 +377,3 @@ class Recorder:
         self._shapes = {name: rows.shape for name, rows in self._datasets.items()}
         if CHECKSUMS in self._datasets:
             self._summed = summed_entries(self._file[CHECKSUMS])
-
-    def _with_new_parameters(self, disk: DiskFile) -> DiskFile:
-        """Replaces the file by a copy with the parameters of this run: they are changed all together or not at all.
-
-        Returns:
-            the copy, locked; `disk`, which was the file before, is closed.
-
-        Raises:
-            DiskError: there is no room for a copy; the file is as it was.
-        """
-        import h5py
-
-        temporary = self.path.with_name(self.path.name + ".tmp")
-        try:
-            shutil.copyfile(self.path, temporary)
-            changed = DiskFile(temporary)
-            changed.reserve(os.path.getsize(temporary) + len(self._parameters["scene"]) + (1 << 16))
-            with h5py.File(temporary, "r+", locking=False, libver=FORMAT) as file:
-                del file["parameters"]
-                add_parameters(file, self._parameters)
-            changed.sync()
-            os.replace(temporary, self.path)
-        except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            if isinstance(error, DiskError):
-                error = error.__cause__ or error
-            raise DiskError.of(self.path, error) from None
-        finally:
-            disk.close()
-        return changed

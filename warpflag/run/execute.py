@@ -15,7 +15,7 @@ from warpflag_kernels.stepping.health import Fault
 from warpflag.base.output import sync_file_systems
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
-from warpflag.record import Frame, Record, RecordError
+from warpflag.record import FrameRows, Record, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
 from warpflag.run.growth import PATIENCE, Growth, chosen, growth
@@ -158,7 +158,7 @@ class Run:
         self._stop(faults)
         self._complete([c for c, member in enumerate(self.members) if member.outcome is None and c not in faults])
 
-    def _write(self, block: Sequence[Mapping[int, Frame]]) -> set[int]:
+    def _write(self, block: Sequence[Mapping[int, FrameRows]]) -> set[int]:
         """Records frames; returns the cells whose last ones were among them."""
 
         def write(cell: int) -> bool:

@@ -6,7 +6,7 @@ Frames are taken on the device, inside steps (`warpflag_kernels.stepping.dense_o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +17,12 @@ from warpflag.model.switching import corners
 from warpflag.observables.bundle import bundle_length
 from warpflag.observables.motion import along_axis
 from warpflag.observables.phase import phase_difference
-from warpflag.record import Frame
+from warpflag.record import Frame, FrameRows
 from warpflag.run.cells import Cells, motor_torques
 from warpflag.scene import Scene
 from warpflag.stepping import Stepper, System
 
-__all__ = ["Frames", "finite_time"]
+__all__ = ["Frames", "finite_time", "one_by_one"]
 
 _NEVER = 1e9  # [s]; finite, since fixed steps divide what is left of the time
 _ROUNDING = 1e-6  # of a frame interval: times this close are the same
@@ -143,7 +143,7 @@ class Frames:
         behind = np.floor(times / self._durations * self._counts + _ROUNDING).astype(np.int64)
         self.index = np.where(begun, np.maximum(self.index, behind), -1)
 
-    def first(self, now: Cells) -> list[dict[int, Frame]]:
+    def first(self, now: Cells) -> list[dict[int, FrameRows]]:
         """The first frame of every cell, at its present time; rates, differences between two frames, are NaN."""
         self.index[:] = 0
         self.pass_by(now.time)
@@ -186,7 +186,7 @@ class Frames:
         beyond = np.full(len(self._ends), _NEVER) if until is None else np.maximum(self._ends, until)
         return np.where(self._scheduled > 0, beyond, 0.0)
 
-    def collect(self, until: float | None, waiting: np.ndarray, times: np.ndarray) -> list[dict[int, Frame]]:
+    def collect(self, until: float | None, waiting: np.ndarray, times: np.ndarray) -> list[dict[int, FrameRows]]:
         """All frames up to the times that the cells have reached: the next one of each cell, by cell, and so on.
 
         Args:
@@ -201,7 +201,7 @@ class Frames:
             found += self._in_slots()
         return found
 
-    def _in_slots(self) -> list[dict[int, Frame]]:
+    def _in_slots(self) -> list[dict[int, FrameRows]]:
         assert self._dense is not None
         d, model = self._dense.data, self._system.model
         counts = d.taken.numpy().astype(np.int64)
@@ -249,35 +249,33 @@ class Frames:
     def _flagella(self, cell: int) -> slice:
         return slice(int(self._first_flagellum[cell]), int(self._first_flagellum[cell + 1]))
 
-    def _measured(self, block: _Block) -> list[dict[int, Frame]]:
-        """Observables of all frames of cells of one structure at once."""
-        found: list[dict[int, Frame]] = [{} for _ in range(int(block.counts.max()))]
+    def _measured(self, block: _Block) -> list[dict[int, FrameRows]]:
+        """The frames of a block, by cell; observables of all cells of one structure are found at once."""
+        found: dict[int, FrameRows] = {}
         for group in self._by_structure(block.counts):
-            m = np.concatenate([np.arange(block.counts[c]) for c in group])
-            cells = np.repeat(group, block.counts[group])
-            measured = self._observables(block, m, cells)
-            for row, (i, c) in enumerate(zip(m.tolist(), cells.tolist(), strict=True)):
-                observables = {name: values[row] for name, values in measured.items()}
-                observables["steric_force_density"] = block.steric_force[i, c] / self._lengths[c]
+            counts = block.counts[group]
+            m = np.concatenate([np.arange(count) for count in counts])
+            measured = self._observables(block, m, np.repeat(group, counts))
+            for c, count, end in zip(group, counts.tolist(), np.cumsum(counts).tolist(), strict=True):
+                observables = {name: values[end - count : end] for name, values in measured.items()}
+                observables["steric_force_density"] = block.steric_force[:count, c] / self._lengths[c]
                 flagella = self._flagella(c)
                 nodes = slice(int(self._first_node[flagella.start]), int(self._first_node[flagella.stop]))
-                found[i][c] = Frame(
-                    time=float(block.time[i, c]),
-                    step=int(block.step[i, c]),
-                    positions=block.positions[i, nodes],
-                    directors=block.directors[i, nodes],
-                    motor_angle=block.motor_angle[i, flagella],
-                    body_position=block.body_position[i, c],
-                    body_orientation=block.body_orientation[i, c],
+                found[c] = FrameRows(
+                    time=block.time[:count, c],
+                    step=block.step[:count, c],
+                    positions=block.positions[:count, nodes],
+                    directors=block.directors[:count, nodes],
+                    motor_angle=block.motor_angle[:count, flagella],
+                    body_position=block.body_position[:count, c],
+                    body_orientation=block.body_orientation[:count, c],
                     observables=observables,
-                    forms=block.forms[i, nodes] if self._polymorphs else None,
+                    forms=block.forms[:count, nodes] if self._polymorphs else None,
                 )
-        for c in np.flatnonzero(block.counts).tolist():
-            at, flagella = block.counts[c] - 1, self._flagella(c)
-            for name in _MOTION:
-                own = flagella if name == "motor_angle" else c
-                self.last[name][own] = getattr(block, name)[at, own]
-        return found
+                for name, values in self.last.items():
+                    own = flagella if name == "motor_angle" else c
+                    values[own] = getattr(block, name)[count - 1, own]
+        return [found] if found else []
 
     def _by_structure(self, counts: np.ndarray) -> list[list[int]]:
         """Cells that have frames, in groups whose flagella have the same numbers of nodes."""
@@ -320,3 +318,10 @@ class Frames:
             "body_rate": turned / (2 * np.pi * duration),
             "motor_rate": motors_turned / (2 * np.pi * duration[:, None]),
         }
+
+
+def one_by_one(block: Iterable[Mapping[int, FrameRows]]) -> Iterator[dict[int, Frame]]:
+    """The next frame of each cell that has one, by cell, one after the other."""
+    for rows in block:
+        for k in range(max(map(len, rows.values()))):
+            yield {cell: own.frame(k) for cell, own in rows.items() if k < len(own)}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.record import RECORD_NAME, Frame, Record
+from warpflag.record import RECORD_NAME, FrameRows, Record
 from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter, versions
 from warpflag.run import checkpoint
@@ -74,9 +74,8 @@ class Member:
         self._unnamed = False  # a checkpoint is written that has not its name yet
         self._began = monotonic() - (resumed["wall_time"] if resumed else 0.0)
         step = resumed["step"] if resumed else None
-        self.recorder = Recorder(
-            directory / RECORD_NAME, resume_step=step, block_frames=_FRAMES_PER_COMMIT, keep_open=alone
-        )
+        options = {"block_frames": _FRAMES_PER_COMMIT, "keep_open": alone, "expected": scene.frames + 1}
+        self.recorder = Recorder(directory / RECORD_NAME, resume_step=step, **options)
 
     @property
     def wall_time(self) -> float:
@@ -96,18 +95,18 @@ class Member:
         """Opens the record; flagellum k has the nodes first_node[k] to first_node[k + 1] - 1."""
         start_reporter(self.recorder, self.scene, first_node, self.text)
 
-    def write(self, frames: Sequence[Frame]) -> bool:
+    def write(self, frames: Sequence[FrameRows]) -> bool:
         """Records frames, one at least; returns whether the last of the scene was among them.
 
         Raises:
             OSError: the disk is all but full; what was recorded before still fits.
         """
-        count = max(_FRAMES_OF_ROOM, len(frames) + _FRAMES_PER_COMMIT)
-        needed = _LEAST_ROOM + count * (frames[0].positions.nbytes + frames[0].directors.nbytes)
+        count = max(_FRAMES_OF_ROOM, sum(map(len, frames)) + _FRAMES_PER_COMMIT)
+        needed = _LEAST_ROOM + count * (frames[0].positions[0].nbytes + frames[0].directors[0].nbytes)
         if shutil.disk_usage(self.directory).free < needed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.directory))
-        for frame in frames:
-            self.recorder.write(frame)
+        for rows in frames:
+            self.recorder.write_rows(rows)
         return self.recorder.frame_count == self.scene.frames + 1
 
     def save(self, arrays: Mapping[str, np.ndarray], device: str, sync: bool = True) -> None:

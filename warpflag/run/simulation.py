@@ -23,12 +23,12 @@ from warpflag.model.build import begin_forms, build_chart, build_control, build_
 from warpflag.model.geometry import InitialState
 from warpflag.model.start import check_outside
 from warpflag.model.starts import starting_states
-from warpflag.record import Frame
+from warpflag.record import Frame, FrameRows
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, hand_over
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
-from warpflag.run.frames import Frames, finite_time
+from warpflag.run.frames import Frames, finite_time, one_by_one
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 
@@ -157,11 +157,11 @@ class Simulation:
     ) -> Iterator[dict[int, Frame]]:
         """The frames of `frame_blocks` one after the other: the next frame of each cell that has one, by cell."""
         for block in self.frame_blocks(until, watch):
-            yield from block
+            yield from one_by_one(block)
 
     def frame_blocks(
         self, until: float | None = None, watch: Callable[[], None] | None = None
-    ) -> Iterator[list[dict[int, Frame]]]:
+    ) -> Iterator[list[dict[int, FrameRows]]]:
         """Advances every cell, and yields frames of each at multiples of its own scene's duration / frames.
 
         Frames are taken inside steps and handed over in blocks, so cells are ahead of them: after a block, up to the
@@ -173,7 +173,7 @@ class Simulation:
             watch: as in `advance`.
 
         Returns:
-            An iterator over blocks: the next frame of each cell that has one, by cell; then those after them. A block
+            An iterator over blocks: the next frames of each cell that has any, by cell; then those after them. A block
             may be empty, since the host also looks a few times a second.
         """
         until = None if until is None else finite_time(until)
@@ -193,7 +193,7 @@ class Simulation:
         return self._frames.schedule(until, self._going_on())
 
     @alone
-    def _collect(self, until: float | None) -> list[dict[int, Frame]]:
+    def _collect(self, until: float | None) -> list[dict[int, FrameRows]]:
         return self._frames.collect(until, self._going_on(), self.times)
 
     def exclude(self, cell: int) -> None:

@@ -80,7 +80,7 @@ def found_by_run(scene: Scene, device: str | None, late: Callable[[], bool], tol
     simulation = Simulation(coarse, device=device)
     frames: list[Frame] = []
     for block in simulation.frame_blocks():
-        frames += [frame for found in block for frame in found.values()]
+        frames += [rows.frame(k) for found in block for rows in found.values() for k in range(len(rows))]
         told(len(frames) / (_FRAMES + 1))
         if late() and len(frames) > 1:
             break
