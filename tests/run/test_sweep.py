@@ -105,35 +105,31 @@ def test_no_batch_gets_the_long_members(period):
     assert max(sums) < 1.2 * np.mean(sums)  # 1.8 in order, 2.0 every fourth
 
 
-def test_the_size_of_batches_follows_what_was_measured():
-    best_size = batches.best_size
-    assert best_size(8, 2, alone=0.3, together=0.4, sample=8, largest=64)[0] == 1  # a batch is dearer
-    assert best_size(8, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 8  # one worker takes all
-    assert best_size(8, 2, alone=0.4, together=0.1, sample=8, largest=64)[0] == 4  # two take half each
-    assert best_size(2, 2, alone=0.4, together=0.1, sample=2, largest=64)[0] == 1
-    assert best_size(2000, 1, alone=0.4, together=0.1, sample=8, largest=64)[0] == 64
-    # A member takes 0.1 s of its own, and a batch 0.2 s once: alone 0.3, in a batch of 8 0.125 s.
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=64)
-    assert (size, seconds) == pytest.approx((64, 64 * 0.1 + 0.2))
-    size, seconds = best_size(64, 1, alone=0.3, together=0.125, sample=8, largest=16)
-    assert (size, seconds) == pytest.approx((16, 64 * 0.1 + 4 * 0.2))
-    size, seconds = best_size(1000, 2, alone=0.4, together=0.3, sample=8, largest=64)
-    assert 4 < size < 64 and 0.5 * 1000 * 0.29 < seconds < 0.5 * 1000 * 0.4
+@pytest.mark.parametrize(
+    "count, workers, sizes",
+    [
+        (24, 1, [24]),
+        (24, 2, [12, 12]),
+        (7, 2, [4, 3]),
+        (3, 8, [1, 1, 1]),
+        (130, 2, [32, 32, 33, 33]),  # no worker takes two batches beside another that takes one
+        (1000, 3, [55] * 8 + [56] * 10),
+    ],
+)
+def test_workers_take_equal_shares_in_as_few_batches_as_may_be(count, workers, sizes):
+    size = batches.share(count, workers, 64)
+    assert sorted(map(len, batches.cut(range(count), size))) == sizes
 
 
-@pytest.mark.parametrize("duration, measured", [(4e-5, False), (9.0, True)])
-def test_only_what_takes_long_is_measured(tmp_path, monkeypatch, capsys, duration, measured):
-    asked = []
-    monkeypatch.setattr(Pool, "measure", lambda self, samples, *_: asked.append(samples) or [0.4, 0.1])
-    base = small({"duration": duration, "frames": 4, "flagella.length": 6.0})
-    started = sweep.start(Sweep(base, {"motor.torque": [1.0, 2.0, 3.0, 3.4]}), str(tmp_path / "out"))
-    workers = Pool(["cpu"] * 2, {})
-    found = started.batches_for(workers, [0, 1, 2, 3], False, None)  # pyright: ignore[reportArgumentType]
-    assert bool(asked) == measured
-    assert sorted(map(len, (own.members for own in found))) == [2, 2]
-    said = capsys.readouterr().err
-    assert "4 members on 2 workers (cpu), batches of 2" in said and ("0.4 s alone" in said) == measured
+def test_batches_are_of_members_with_one_structure(tmp_path, capsys):
+    axes = {"hydrodynamics.mode": ["none", "all"], "motor.torque": [1.0, 2.0, 3.0, 3.4]}
+    started = sweep.start(Sweep(small(BASE), axes), str(tmp_path / "out"))
+    found = started.batches_for(Pool(["cpu"] * 2, {}), list(range(8)), False)
+    assert sorted(map(len, (own.members for own in found))) == [2, 2, 2, 2]
+    assert "8 members on 2 workers (cpu), batches of 2" in capsys.readouterr().err
+    assert sorted(k for own in found for k in own.members) == list(range(8))
     for own in found:
+        assert len({scene.hydrodynamics.mode for scene in own.scenes}) == 1
         assert [path.name for path in own.directories] == [f"{k:04d}" for k in own.members]
         assert [scene.name for scene in own.scenes] == [started.members[k].scene.name for k in own.members]
 

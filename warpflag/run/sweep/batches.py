@@ -13,12 +13,9 @@ from warpflag.run.run import begun_at_checkpoint
 from warpflag.run.sweep.table import status_of
 from warpflag.scene import Scene
 
-__all__ = ["Batch", "best_size", "cut", "groups", "is_short", "share"]
+__all__ = ["Batch", "cut", "groups", "share"]
 
 _GOLDEN = (5.0**0.5 - 1.0) / 2.0  # golden ratio: its multiples modulo 1 lie most evenly
-# Node seconds for each worker, a minute of computing of examples/zipping.toml. For 24 runs of 150 ms of it the
-# measurement chose batches of two, which took a fifth longer than equal shares.
-_SHORT = 1000.0
 
 
 @dataclass(frozen=True)
@@ -68,41 +65,16 @@ def cut(group: Sequence[int], size: int) -> list[list[int]]:
     return [sorted(group[i] for i in order[first:last]) for first, last in itertools.pairwise(ends)]
 
 
-def is_short(scenes: Sequence[Scene], workers: int) -> bool:
-    """Whether members are so few, small and short that all will have ended before measuring them pays."""
-    needed = sum(scene.duration * sum(spec.segment_count + 1 for spec in scene.resolved_flagella()) for scene in scenes)
-    return needed <= _SHORT * workers
-
-
 def share(count: int, workers: int, largest: int) -> int:
-    """Members of a batch where each worker takes an equal share of a group, in as few batches as may be."""
-    return min(math.ceil(count / workers), largest)
+    """Members of a batch where every worker takes equal shares of a group, as few and as large as may be.
 
-
-def best_size(count: int, workers: int, alone: float, together: float, sample: int, largest: int) -> tuple[int, float]:
-    """Members of a batch with which the sweep is expected to end first, the fewest of those.
-
-    A member of a batch of s takes a + b / s: what a batch shares is spread over its members. Members differ, and which
-    are the long ones is not known, so the last batch is taken to keep one worker busy for half its length alone.
+    What starts and ends with a batch is spread over its members, and none takes longer beside others. Shares end
+    together, since `cut` deals out long and short members alike; smaller batches cost more than they even out.
 
     Args:
-        count: members to run.
+        count: members of the group.
         workers: processes that take batches.
-        alone: time of a member by itself [s].
-        together: time per member in a batch of `sample` [s].
-        sample: members of the batch that was measured.
         largest: most members of a batch.
-
-    Returns:
-        Members of a batch, and the wall time that is expected [s].
     """
-    shared = min(max(0.0, (alone - together) / (1.0 - 1.0 / sample)), alone)
-    own = alone - shared
-
-    def expected(size: int) -> float:
-        rounds = math.ceil(math.ceil(count / size) / workers)
-        even = min(rounds * size, count) if workers > 1 else count
-        return (own + shared / size) * (even + (0.5 * size if workers > 1 else 0.0))
-
-    size = min(range(1, min(count, largest) + 1), key=expected)
-    return size, expected(size)
+    rounds = math.ceil(count / (workers * largest))
+    return math.ceil(count / (workers * rounds))

@@ -170,32 +170,19 @@ class Pool:
         """Simulated time that all members have reached [s]."""
         return self._done_time + sum(worker.reached for worker in self._workers)
 
-    def measure(self, samples: Sequence[Sequence[Scene]], stop: Stop, quiet: bool = False) -> list[float]:
-        """Time per cell of its start and of its run [s], of each sample of scenes advanced together.
+    def measure(self, sample: Sequence[Scene], stop: Stop) -> float:
+        """Time per cell of its start and of its run [s], of scenes advanced together.
 
-        On the CPU it is computing time, which what else the machine does leaves alone.
-
-        Two workers measure at the same time, as they will run. A sample that can't be run costs nothing: one by one,
-        each member tells what is wrong.
+        On the CPU it is computing time, which what else the machine does leaves alone. A sample that can't be run
+        costs nothing: one by one, each member tells what is wrong.
         """
-        asked = self._workers[: len(samples)]
-        found = [0.0] * len(samples)
-
-        def measure(own: int) -> None:
-            for k in range(own, len(samples), len(asked)):
-                request = {"measure": [dumps(scene) for scene in samples[k]], "device": asked[own].device}
-                found[k] = asked[own].ask({**request, "quiet": quiet}).get("seconds", 0.0)
-
-        threads = [threading.Thread(target=measure, args=(own,), daemon=True) for own in range(len(asked))]
+        worker = self._workers[0]
+        request = {"measure": [dumps(scene) for scene in sample], "device": worker.device, "quiet": False}
         stop.at_once = True
         try:
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
+            return worker.ask(request).get("seconds", 0.0)
         finally:
             stop.at_once = False
-        return found
 
     def submit(self, batch: Batch) -> None:
         """Queues a batch; the workers begin with the first."""

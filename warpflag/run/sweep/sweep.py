@@ -24,7 +24,7 @@ from warpflag.run.sweep import batches, table
 from warpflag.run.sweep.batches import Batch
 from warpflag.run.sweep.plan import BASE_NAME, Member, Sweep, check_members, read
 from warpflag.run.sweep.pool import Pool
-from warpflag.scene import Scene, SceneError
+from warpflag.scene import SceneError
 from warpflag.scene.resistance import filament_mobility
 
 __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
@@ -32,7 +32,7 @@ __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
 _LARGEST_BATCH = {"cpu": 64, "cuda": 512}  # members: what a worker that dies begins again; a GPU needs many to be full
-_SAMPLE_CELLS = 8  # members on which batch and single runs are timed
+_SAMPLE_CELLS = 8  # members that are timed
 _SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run
 _SECONDS_FOR_LOCKS = 10.0  # for which members of a sweep that was killed may still be held by its workers
 
@@ -161,7 +161,7 @@ class SweepRun:
         with Pool([devices[k % len(devices)] for k in range(count)], options, starter) as pool:
             try:
                 pool.start(self.members[pending[0]].scene, stop, quiet)
-                for batch in self.batches_for(pool, pending, quiet, stop):
+                for batch in self.batches_for(pool, pending, quiet):
                     pool.submit(batch)
                 progress.update(0.0)
                 import h5py  # noqa: F401 (the table's, while this process has nothing else to do)
@@ -187,50 +187,28 @@ class SweepRun:
                 progress.close()
         return ended, failed
 
-    def batches_for(self, pool: Pool, pending: list[int], quiet: bool, stop: Stop) -> list[Batch]:
-        """What the workers take: by what a few members cost alone and together, or, of a short sweep, equal shares."""
+    def batches_for(self, pool: Pool, pending: list[int], quiet: bool) -> list[Batch]:
+        """What the workers take: equal shares of the members that can advance together."""
         workers, kind = len(pool.devices), "cuda" if pool.devices[0].startswith("cuda") else "cpu"
-        largest, groups = _LARGEST_BATCH[kind], self._groups(pending)
-        if batches.is_short([self.members[k].scene for k in pending], workers):
-            sizes = [batches.share(len(group), workers, largest) for group in groups]
-            told = "equal shares: it is too short to measure first"
-        else:
-            size, told = self._measured_size(pool, groups, largest, quiet, stop)
-            sizes = [size] * len(groups)
-        cut = [own for group, size in zip(groups, sizes, strict=True) for own in batches.cut(group, size)]
+        cut = [
+            own
+            for group in self._groups(pending)
+            for own in batches.cut(group, batches.share(len(group), workers, _LARGEST_BATCH[kind]))
+        ]
         if not quiet and len(pending) > 1:
             most = max(map(len, cut))
             which = f"batches of {most}" if most > 1 else "one by one"
             on = f"{workers} worker{'s' if workers > 1 else ''} ({', '.join(dict.fromkeys(pool.devices))})"
-            tell(f"{counted_members(len(pending))} on {on}, {which}{', ' if told else ''}{told}")
+            tell(f"{counted_members(len(pending))} on {on}, {which}")
         return [Batch(own, [self._directory(k) for k in own], [self.members[k].scene for k in own]) for own in cut]
 
-    def _measured_size(
-        self, pool: Pool, groups: Sequence[Sequence[int]], largest: int, quiet: bool, stop: Stop
-    ) -> tuple[int, str]:
-        """Members of a batch with which the sweep ends first, and why."""
-        samples = self._samples(groups)
-        if len(samples[1]) < 2:
-            return 1, ""
-        alone, together = pool.measure(samples, stop, quiet)
-        count, sample = sum(map(len, groups)), len(samples[1])
-        size, seconds = batches.best_size(count, len(pool.devices), alone, together, sample, largest)
-        idle = "since batches would leave workers idle, " if size == 1 and together < alone else ""
-        costs = f"a member takes {alone:.2g} s alone, {together:.2g} s in a batch of {sample}"
-        return size, f"{idle}about {seconds:.2g} s: {costs}"
-
-    def _samples(self, groups: Sequence[Sequence[int]]) -> list[list[Scene]]:
-        """Members to measure alone and together: some of the largest group, from all over it."""
-        largest = max(groups, key=len)
-        own = [self.members[k].scene for k in batches.cut(largest, min(_SAMPLE_CELLS, len(largest)))[0]]
-        return [own[len(own) // 2 :][:1], own]
-
     def seconds_per_member(self, pending: Sequence[int], device: str | None, stop: Stop) -> float:
-        """Time of a member on one worker, the lesser of alone and in a batch, measured on a few of them [s]."""
-        samples = self._samples(self._groups(pending))
+        """Time of a member on one worker, measured on a batch of a few from all over the largest group [s]."""
+        largest = max(self._groups(pending), key=len)
+        sample = [self.members[k].scene for k in batches.cut(largest, min(_SAMPLE_CELLS, len(largest)))[0]]
         with Pool([device or _devices()[0]], {}) as pool:
-            pool.start(samples[0][0], stop)
-            return min(pool.measure(samples, stop))
+            pool.start(sample[0], stop)
+            return pool.measure(sample, stop)
 
     def _directory(self, member: int) -> Path:
         return self.directory / self.names[member]
