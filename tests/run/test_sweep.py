@@ -110,7 +110,7 @@ def test_no_batch_gets_the_long_members(period):
     [
         (24, 1, [24]),
         (24, 2, [12, 12]),
-        (7, 2, [4, 3]),
+        (7, 2, [3, 4]),
         (3, 8, [1, 1, 1]),
         (130, 2, [32, 32, 33, 33]),  # no worker takes two batches beside another that takes one
         (1000, 3, [55] * 8 + [56] * 10),
@@ -132,6 +132,19 @@ def test_batches_are_of_members_with_one_structure(tmp_path, capsys):
         assert len({scene.hydrodynamics.mode for scene in own.scenes}) == 1
         assert [path.name for path in own.directories] == [f"{k:04d}" for k in own.members]
         assert [scene.name for scene in own.scenes] == [started.members[k].scene.name for k in own.members]
+
+
+def test_the_time_of_a_member_is_measured_on_some(tmp_path):
+    """What jobs on a cluster are cut by: it grows with the length of the runs, which are not run."""
+    seconds = []
+    for k, duration in enumerate((4e-5, 4.0)):
+        started = sweep.start(
+            Sweep(small(BASE | {"duration": duration}), {"motor.torque": [1.0, 2.0]}), str(tmp_path / f"{k}")
+        )
+        with Stop() as stop:
+            seconds.append(started.seconds_per_member([0, 1], "cpu", stop))
+        assert started.statuses() == ["missing"] * 2
+    assert 0.0 < 10.0 * seconds[0] < seconds[1]
 
 
 def test_what_is_done_is_not_run_again(tmp_path):
