@@ -178,6 +178,36 @@ def test_precision_wins_over_set(scene):
     assert load("runs/small/scene.toml").numerics.precision == "float32"
 
 
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError("Unable to allocate 118. MiB"), RuntimeError("Failed to allocate 8 bytes on device 'cpu'")],
+    ids=["NumPy", "Warp"],
+)
+def test_too_little_memory_is_one_line(scene, capsys, monkeypatch, error):
+    def short(*_arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr("warpflag.run.simulation.build_model", short)
+    assert cli.main(["run", scene, "-o", "out"]) == 1
+    assert capsys.readouterr().err == f"warpflag: out of memory: {error}\n"
+    monkeypatch.setattr("warpflag.run.simulation.build_model", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["run", scene, "-o", "out"])
+
+
+@pytest.mark.parametrize("allowed, status", [(1.2e9, 1), (8e9, 0)])
+def test_a_process_that_may_have_too_few_addresses_is_told_so(scene, allowed, status):
+    """Below some 1.7 GB Warp's compiler crashes."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (int(allowed), resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+    ended = command("run", scene, "-o", "out", "--quiet", preexec_fn=limited)
+    assert ended.returncode == status, ended.stderr
+    if status:
+        assert ended.stderr.count("\n") == 1 and "1.2 of the 2 GB" in ended.stderr and "ulimit -v" in ended.stderr
+
+
 def test_the_wall_time_ends_a_run_with_its_own_status(scene, capsys):
     assert cli.main(["run", scene, "-o", "made", "--max-wall", "0", "--set", "duration=1.0", "frames=100000"]) == 143
     line = capsys.readouterr().err.splitlines()[-1]

@@ -55,6 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return tell(_located(error, options), BAD_INPUT)
     except OSError as error:
         return tell(machine_error(error), FAILED)
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "Failed to allocate" not in str(error):  # as Warp says it
+            raise
+        return tell(f"out of memory: {' '.join(str(error).split())}", FAILED)
 
 
 def _bad_input() -> tuple[type[Exception], ...]:

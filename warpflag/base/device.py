@@ -42,13 +42,21 @@ class DeviceError(ValueError):
     """This machine has no such device; the message is one line that says which it has."""
 
 
+LEAST_ADDRESSES = 2.0e9
+"""Address space below which loading kernels ends in a crash instead of an error [bytes]: 1.6e9 crashed, 1.8e9 ran."""
+
+
 @functools.cache
 def start_warp() -> Any:
     """The module `warp`, initialised, with nothing said below warnings.
 
     Its library writes to the process's standard error that there is no CUDA driver. On a machine without a GPU that
     is no news, so what it writes while it starts is caught and only the rest passed on.
+
+    Raises:
+        MemoryError: this process may not have the addresses that Warp's compiler needs, without which it crashes.
     """
+    _check_addresses()
     import warp as wp
 
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
@@ -71,6 +79,17 @@ def start_warp() -> Any:
         os.close(kept)
     say("".join(line for line in lines if "find or load the NVIDIA CUDA driver" not in line))
     return wp
+
+
+def _check_addresses() -> None:
+    try:
+        import resource
+    except ImportError:  # no POSIX system
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESSES:
+        allowed = f"{limit / 1e9:.3g} of the {LEAST_ADDRESSES / 1e9:.3g} GB of addresses that kernels need"
+        raise MemoryError(f"this process may have {allowed} (ulimit -v)")
 
 
 def find_device(name: Any = None) -> Any:
