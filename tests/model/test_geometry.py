@@ -102,6 +102,15 @@ def test_segments_that_span_half_a_turn_are_refused():
         )
 
 
+@pytest.mark.parametrize("strain", [(0.0, 1.3, 0.0), (1.3, 0.0, -0.1)])
+def test_a_flat_helix_does_not_grow_on_its_axis(strain):
+    with pytest.raises(SceneError, match=r"flagella\.on_axis = true: needs a pitch of 0\.5 um or more"):
+        cell({"flagella.on_axis": True, "flagella.intrinsic_curvature": strain})
+    for fine in ((0.0, 0.0, 0.0), (0.0, 0.0, -2.1), (0.0, 1.3, -0.3)):
+        cell({"flagella.on_axis": True, "flagella.intrinsic_curvature": fine})
+    cell({"flagella.on_axis": False, "flagella.intrinsic_curvature": strain})
+
+
 def test_ground_state_converges_to_the_continuum_helix_at_second_order():
     curvature, torsion = NORMAL[1], -NORMAL[2]
     squared = curvature**2 + torsion**2

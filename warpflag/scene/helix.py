@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpflag.base import rotations
+from warpflag.scene.smooth_helix import TAPER
 
 __all__ = ["DiscreteHelix", "RestShape", "across", "ground_state", "joint_strain", "rest_shape", "rotation_matrix"]
 
 Array = NDArray[np.floating]
 
-TAPER = 0.5  # um; axial length over which the amplitude of a flagellum on its helix axis grows to that of the helix
 _STRAIGHT = 1e-9  # um; a helix of smaller radius has no direction from its axis to a node
 
 

@@ -30,6 +30,7 @@ from warpflag.scene.sections import (
     Steric,
 )
 from warpflag.scene.settings import Section, integer, number, switch, text
+from warpflag.scene.smooth_helix import TAPER
 
 __all__ = ["FlagellumSpec", "Scene"]
 
@@ -211,7 +212,7 @@ class Scene(Section, key=""):
             raise SceneError("hook.stiffening_torque", self.hook.stiffening_torque, problem, ["hook.stiffness"])
 
     def _check_helix(self) -> None:
-        """Either strains, or radius and pitch."""
+        """Either strains, or radius and pitch; and a pitch that leaves room to grow on the axis."""
         group = self.flagella
         given = {"helix_radius": group.helix_radius, "helix_pitch": group.helix_pitch}
         for (key, value), (other, missing) in zip(given.items(), reversed(given.items()), strict=True):
@@ -220,6 +221,13 @@ class Scene(Section, key=""):
         if group.helix_radius is not None and group.intrinsic_curvature != Flagella().intrinsic_curvature:
             problem = "must be absent where flagella.helix_radius and helix_pitch are given"
             raise SceneError("flagella.intrinsic_curvature", group.intrinsic_curvature, problem)
+        bend, twist = math.hypot(*group.ground_strain[:2]), abs(group.ground_strain[2])
+        pitch = 2.0 * math.pi * twist / (bend * bend + twist * twist) if bend else math.inf
+        if group.on_axis and pitch < TAPER:
+            problem = f"needs a pitch of {TAPER:g} um or more, in which the helix grows; it is {pitch:.3g} um"
+            raise SceneError(
+                "flagella.on_axis", True, problem, ["flagella.intrinsic_curvature", "flagella.helix_pitch"]
+            )
 
     def _check_noise(self) -> None:
         """What thermal noise does not go with."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import math
 
-__all__ = ["inscribed_strain", "smooth_strain"]
+__all__ = ["TAPER", "inscribed_strain", "smooth_strain"]
+
+TAPER = 0.5  # um; axial length over which the amplitude of a flagellum on its helix axis grows to that of the helix
 
 
 def smooth_strain(radius: float, pitch: float) -> tuple[float, float, float]:
