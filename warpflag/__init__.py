@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from warpflag.record.recorder import Recorder
     from warpflag.run.simulation import NumericalError, Simulation
     from warpflag.scene import Scene, SceneError, load, paper_scene, with_values
+    from warpflag.scene.run_sections import Numerics, Start
     from warpflag.scene.sections import (
         Body,
         External,
@@ -19,9 +20,7 @@ if TYPE_CHECKING:
         Hook,
         Hydrodynamics,
         Motor,
-        Numerics,
         Polymorphs,
-        Start,
         Steric,
     )
 
@@ -62,14 +61,14 @@ _HOMES = {
     "Hydrodynamics": "scene.sections",
     "Motor": "scene.sections",
     "NumericalError": "run.simulation",
-    "Numerics": "scene.sections",
+    "Numerics": "scene.run_sections",
     "Polymorphs": "scene.sections",
     "Record": "record",
     "Recorder": "record.recorder",
     "Scene": "scene",
     "SceneError": "scene",
     "Simulation": "run.simulation",
-    "Start": "scene.sections",
+    "Start": "scene.run_sections",
     "Steric": "scene.sections",
     "load": "scene",
     "paper_scene": "scene",

@@ -129,20 +129,20 @@ CONSTANTS = {
     "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
     "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), UPSET),
     "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), UPSET),
-    "stability.LEAST": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
+    "stability.LEAST_OVER_IMPLICIT": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.OVER_IMPLICIT_PER_KAPPA": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.LARGEST_FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
-    "stability.MOST": Constant("implicit.stability", (5.0, 2.0, 3.0, 9.0), CROWDED),
+    "stability.MOST_OVER_IMPLICIT": Constant("implicit.stability", (5.0, 2.0, 3.0, 9.0), CROWDED),
     "stability.LARGE_KAPPA_OF_FLEXIBLE": Constant("implicit.stability", (15.0, 2.6, 3.7, 5.0, 8.3), CROWDED),
     "stability.FIRST_MEASUREMENTS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
     "contact_solve.DIAGONAL_PER_DRAG": Constant("implicit.contact_solve", (0.25, 0.06, 0.12, 0.5, 1.0), CONTACT_LAW),
     "contact_solve.DEEP": Constant("implicit.contact_solve", (0.75, 0.5, 0.65, 0.85, 1.0), CONTACT_LAW),
     "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
-    "contact_solve.ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
+    "contact_solve.CONTACT_ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
     "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), CONTACT_LAW),
     "contact_solve.NEWTON_STEPS": Constant("implicit.contact_solve", (4, 1, 2, 3, 6), CONTACT_LAW),
-    "quasi_newton.KEPT": Constant(
+    "quasi_newton.SECANTS_KEPT": Constant(
         "implicit.quasi_newton",
         (16, 2, 4, 8, 32),
         CONTACT_LAW,
@@ -164,11 +164,14 @@ CONSTANTS = {
         "stepping.rkc", (1e-3, 1e-5, 1e-4, 1e-2, 1e-1), EXPLICIT, (*RKC, *SINGLE), key="float32"
     ),
     "rkc.DAMPING": Constant("stepping.rkc", (2 / 13, 0.02, 0.05, 0.5), EXPLICIT, RKC),
-    "rkc.ESTIMATE_SHARE": Constant(
-        "stepping.rkc", (0.1, 0.01, 0.03, 0.3, 1.0), EXPLICIT, (("stepper", "rkc"), ("accuracy", 5e-3))
+    "rkc_estimate.ESTIMATE_SHARE": Constant(
+        "stepping.rkc_estimate", (0.1, 0.01, 0.03, 0.3, 1.0), EXPLICIT, (("stepper", "rkc"), ("accuracy", 5e-3))
     ),
-    "rkc.NOISE": Constant(
-        "stepping.rkc", (5.0, 1.0, 20.0, 80.0), ("free", "contact"), (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE)
+    "rkc_estimate.ROUND_OFF_FACTOR": Constant(
+        "stepping.rkc_estimate",
+        (5.0, 1.0, 20.0, 80.0),
+        ("free", "contact"),
+        (("stepper", "rkc"), ("accuracy", 5e-2), *SINGLE),
     ),
     "implicit.FIRST_TOLERANCE": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(

@@ -185,7 +185,7 @@ def test_what_cannot_be_solved_is_reported(name, device, precision):
         l.bench.stepper.law.gap_tolerance.fill_(-1.0)
     l.solve(start)
     assert l.failed()
-    assert l.bench.stepper.law.products.numpy()[0] <= 1 + contact_solve.ITERATIONS
+    assert l.bench.stepper.law.products.numpy()[0] <= 1 + contact_solve.CONTACT_ITERATIONS
 
 
 @pytest.mark.parametrize("name", ["all", "three", "bundle", "anchored", "no body contact"])

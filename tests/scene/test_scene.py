@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from warpflag.scene import FlagellumOverride, Scene, SceneError, dumps, load, loads, paper_scene, sections, with_values
+from warpflag.scene.run_sections import Numerics, Start
 from warpflag.scene.settings import Section
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
@@ -319,8 +320,8 @@ def test_a_written_scene_reads_back_equal(tmp_path):
         flagellum=(FlagellumOverride(), FlagellumOverride(torque=-1 / 3, phase=12.5), FlagellumOverride(60.1)),
         fluid=sections.Fluid(viscosity=2e-3 / 3, drag_rotation=1e-7),
         hydrodynamics=sections.Hydrodynamics("within", 0.02),
-        numerics=sections.Numerics("euler", 1e-9 / 7, "float32", 1e-3),
-        start=sections.Start('a "quoted" \\ path\t\x7f é', 3),
+        numerics=Numerics("euler", 1e-9 / 7, "float32", 1e-3),
+        start=Start('a "quoted" \\ path\t\x7f é', 3),
     )
     assert scene_from(tmp_path, dumps(scene)) == scene
 

@@ -69,7 +69,7 @@ def test_the_device_adds_up_the_estimates_of_accepted_steps(stepper, device):
     sim.advance(scene.duration)
     power = 0.5 if stepper == "implicit" else 1.0
     times, lengths, errors = np.array(found)[2 if stepper == "implicit" else 0 :].T
-    counted = times >= accuracy.BEGIN * SHORTEST_STEP
+    counted = times >= accuracy.UNCOUNTED_STEPS * SHORTEST_STEP
     times, lengths, errors = times[counted], lengths[counted], errors[counted]
     assert 5 < counted.sum() < len(counted)
     allowed = asked * (lengths / 1e-3) ** power

@@ -112,7 +112,7 @@ def test_stiff_strains_become_what_the_linear_step_means(values, precision, devi
     assert abs(missed).max() > 2e-3
     step.correct()
     assert np.linalg.norm(step.ended() - linear) < 0.1 * np.linalg.norm(missed)
-    monkeypatch.setattr(end_strains, "ITERATIONS", 20)
+    monkeypatch.setattr(end_strains, "STRAIN_ITERATIONS", 20)
     step.assign(1.0)
     step.correct()
     assert abs(step.ended() - linear).max() < TOLERANCE[precision] * abs(missed).max()

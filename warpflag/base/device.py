@@ -1,4 +1,4 @@
-"""Warp and its devices: started without chatter, found by name, described."""
+"""Warp and its devices: started silently, found by name, described."""
 
 from __future__ import annotations
 

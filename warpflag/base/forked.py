@@ -27,8 +27,8 @@ _SIGNALS = [
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
     if hasattr(signal, name)
 ]
-_LONGEST = 1 << 16  # bytes of an answer
-_DIGITS = 12  # of the length of a request
+_LONGEST_ANSWER = 1 << 16  # bytes of an answer
+_LENGTH_DIGITS = 12  # of the length of a request
 
 
 class Starter:
@@ -125,11 +125,11 @@ class Starter:
 
     def _send(self, request: dict[str, Any], files: tuple[int, ...] = ()) -> None:
         content = json.dumps(request).encode()
-        socket.send_fds(self.connection, [f"{len(content):{_DIGITS}d}".encode()], files)
+        socket.send_fds(self.connection, [f"{len(content):{_LENGTH_DIGITS}d}".encode()], files)
         self.connection.sendall(content)
 
     def _answer(self) -> Any:
-        if not (answer := self.connection.recv(_LONGEST)):
+        if not (answer := self.connection.recv(_LONGEST_ANSWER)):
             raise ConnectionError("the process that starts workers has ended")
         return json.loads(answer)
 
@@ -169,7 +169,7 @@ def _serve(module: Any) -> None:
     """Answers requests on the standard input, a socket, until it is closed; returns in the processes forked."""
     own = socket.socket(fileno=os.dup(0))
     while True:
-        size, files, _, _ = socket.recv_fds(own, _DIGITS, 2)
+        size, files, _, _ = socket.recv_fds(own, _LENGTH_DIGITS, 2)
         if not size:
             os._exit(0)
         content = b""

@@ -17,7 +17,7 @@ from warpflag.base.device import start_warp
 
 __all__ = ["keep_checksums", "kernel_folder", "remove_damaged"]
 
-_LOADED = (".o", ".cubin", ".ptx", ".meta")  # what Warp reads when it loads a module
+_LOADED_SUFFIXES = (".o", ".cubin", ".ptx", ".meta")  # what Warp reads when it loads a module
 _CHECKSUM = ".crc32"
 
 
@@ -62,7 +62,7 @@ def keep_checksums(folders: Iterable[Path]) -> None:
 
 def _compiled(folder: Path) -> list[Path]:
     try:
-        return sorted(path for path in folder.iterdir() if path.suffix in _LOADED)
+        return sorted(path for path in folder.iterdir() if path.suffix in _LOADED_SUFFIXES)
     except OSError:
         return []
 

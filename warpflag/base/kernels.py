@@ -21,7 +21,7 @@ __all__ = ["load_kernels", "noted_launches"]
 _MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
 EXPLAINED_AFTER = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
 _SECONDS_PER_LOOK = 0.2  # between two counts of what has been compiled: five a second
-_SOUND: set[Path] = set()  # folders of the modules that this process has loaded
+_LOADED_FOLDERS: set[Path] = set()  # folders of the modules that this process has loaded
 
 
 @contextlib.contextmanager
@@ -70,7 +70,7 @@ def load_kernels(
     waiting = sorted(((module, block) for module, block in modules), key=lambda own: (own[0].name, own[1] or 0))
     identifiers = {module.get_module_identifier(1 if device.is_cpu else block) for module, block in waiting}
     folders = {kernel_folder() / identifier for identifier in identifiers}
-    fresh = folders - _SOUND
+    fresh = folders - _LOADED_FOLDERS
     damaged = remove_damaged(fresh)
     if damaged and not quiet:
         tell(f"{len(damaged)} compiled modules in {kernel_folder()} were damaged, and are compiled again")
@@ -87,7 +87,7 @@ def load_kernels(
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
     keep_checksums(fresh)
-    _SOUND.update(folders)
+    _LOADED_FOLDERS.update(folders)
 
 
 def _load(module: Any, block: int | None, device: Any) -> None:

@@ -13,7 +13,7 @@ from warpflag.base.streams import is_terminal, say
 
 __all__ = ["Progress", "bar", "watching"]
 
-_WIDEST = 100  # columns of a bar: a wider one reads no better
+_MOST_COLUMNS = 100  # columns of a bar: a wider one reads no better
 _WIDE = 79  # columns from which on a bar tells the speed, too: below a terminal's usual 80 it does not fit
 _LOG_INTERVAL = 60.0  # s between two lines of a log: a night's run fills some hundred lines
 _LOG_SHARE = 0.01  # progress between two lines: a run of months writes no more than a hundred
@@ -115,7 +115,7 @@ def bar(total: float, layout: str, stream: TextIO | None = None, done: float = 0
     """
     from tqdm import tqdm
 
-    columns = min(_WIDEST, shutil.get_terminal_size().columns) - 1
+    columns = min(_MOST_COLUMNS, shutil.get_terminal_size().columns) - 1
     file: Any = _Silent(sys.stderr if stream is None else stream)
     return tqdm(total=total, initial=done, file=file, ncols=columns, bar_format=layout, smoothing=0.0, miniters=0)
 

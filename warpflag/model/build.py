@@ -177,7 +177,7 @@ def build_chart(model: DeviceModel, starts: Sequence[InitialState]) -> Any:
 
 
 def begin_forms(model: DeviceModel, state: DeviceState, starts: Sequence[InitialState]) -> None:
-    """Forms of polymorphs as the starts have them, their ramps over; nothing where there are none."""
+    """Sets the forms of polymorphs to those of the starts, all ramps over; nothing in scenes without polymorphs."""
     if model.switches.has("polymorphs") and any(start.forms is not None for start in starts):
         joined = []
         for start in starts:
@@ -202,7 +202,10 @@ def _rest_strain(group: Flagella, spec: FlagellumSpec) -> np.ndarray:
 
 
 def _body_mobility(scene: Scene) -> tuple[float, float, float, float]:
-    """Mobility along, across, about and across the axis; an ablated motion has none."""
+    """Translational mobility along and across the axis [um/(s pN)], rotational about and across it [1/(pN um s)].
+
+    A motion that a switch of the scene prevents has zero.
+    """
     if not scene.body.enabled:  # r_0 is a free end, which carries half a segment
         (spec,) = scene.resolved_flagella()
         own = filament_mobility(scene, spec.segment_length)

@@ -25,13 +25,13 @@ __all__ = ["body_gaps", "clear_start"]
 Array = NDArray[np.floating]
 
 _PHASES = np.array([5.0 * sign * i for i in range(1, 37) for sign in (1, -1)][:-1])  # deg from the usual one, in turn
-_ROUNDS = 3  # over the flagella at fault: one that changes its phase may touch another then
+_PHASE_ROUNDS = 3  # rounds over the flagella at fault: one that changes its phase may then touch another
 _WANTED = 0.9  # distance that a flagellum at fault is given, in diameters of the contact
 _TURNS = 300  # steps of turning
 _LARGEST_STEP = 0.03  # rad: moves the tip of a flagellum of 7 um by the radius of its helix
-_LARGEST_TURN = 45.0  # deg; beyond, the scene is refused
-_SOFT = 1e-4  # um^2; arms that turn a contact by less than a hundredth of it hardly count
-_MOST = 500  # flagella; in larger crowds those that are on each other are left to the contact force
+_LARGEST_TOTAL_TURN = 45.0  # deg; a flagellum that would have to be turned by more is refused
+_SOFT = 1e-4  # um^2; regularises the least squares: lever arms below its root, 0.01 um, hardly count
+_MOST_FLAGELLA = 500  # in larger crowds flagella that overlap at the start are left to the contact force
 
 
 def body_gaps(body: Body, points: Array) -> Array:
@@ -57,7 +57,7 @@ def clear_start(scene: Scene, start: InitialState) -> InitialState:
     if scene.flagella.phase_difference is not None:
         free[:2] = [False] * 2
     changed: dict[int, float] = {}
-    for _ in range(_ROUNDS):
+    for _ in range(_PHASE_ROUNDS):
         for k in faults:
             if free[k] and cell.shortfall(k, cell.nodes[k]) > 0.0:
                 changed[k] = cell.choose_phase(k, changed.get(k))
@@ -91,7 +91,7 @@ class _Cell:
     def __init__(self, scene: Scene, start: InitialState) -> None:
         self._scene, self._specs = scene, scene.resolved_flagella()
         self._with_body = scene.body.contact and scene.body.enabled
-        self._with_others = scene.steric.enabled and 1 < len(self._specs) <= _MOST
+        self._with_others = scene.steric.enabled and 1 < len(self._specs) <= _MOST_FLAGELLA
         self._diameter = steric_diameter(scene)
         self.nodes = [np.array(x) for x in start.positions]
         self.directors = [np.array(e1[1:]) for e1 in start.directors]
@@ -130,7 +130,7 @@ class _Cell:
         return best[1]
 
     def turn(self) -> dict[int, float]:
-        """Turns flagella about their anchors until they are clear, or no further; returns by how much [rad]."""
+        """Turns flagella about their anchors until they are clear or a limit is reached; their turns [rad]."""
         turned: dict[int, Array] = {}
         for _ in range(_TURNS):
             faults, moved = self.faults(), False
@@ -141,7 +141,7 @@ class _Cell:
                     continue
                 rotation = rotation_matrix(step / angle, min(angle, _LARGEST_STEP))
                 total = rotation @ turned.get(k, np.eye(3))
-                if _angle(total) > math.radians(_LARGEST_TURN):
+                if _angle(total) > math.radians(_LARGEST_TOTAL_TURN):
                     continue
                 turned[k], moved = total, True
                 anchor = self.nodes[k][0]
@@ -153,7 +153,7 @@ class _Cell:
 
     def tilt(self, k: int) -> dict[int, float]:
         """Gives flagellum k the nearest tilt at which it is clear, if there is one; returns by how much [rad]."""
-        for spec, shape in self._tilted(k, _LARGEST_TURN):
+        for spec, shape in self._tilted(k, _LARGEST_TOTAL_TURN):
             if self.shortfall(k, shape[0]) == 0.0:
                 self.nodes[k], self.directors[k] = shape
                 return {k: math.radians(abs(spec.tilt - self._specs[k].tilt))}

@@ -42,11 +42,15 @@ _PHASE_TOLERANCE = 1e-6  # of a phase difference: 1 asked for is 1 - 1e-8 found
 class InitialState:
     """Where a simulation starts.
 
-    positions: nodes r_0..r_N per flagellum, lab [um], shape [N + 1, 3]. directors: e1 of the motor tripod and
-    of segments 1..N, shape [N + 1, 3]. body_position [um], shape [3]; body_orientation, quaternion
-    (x, y, z, w) from body axes to lab axes, shape [4]; time [s]. notes: what was changed of a scene's own shape to
-    begin clear of body and other flagella, a line each. forms: of polymorphs at every node, shape [node]; absent: that
-    of the ground state.
+    Attributes:
+        positions: nodes r_0..r_N of each flagellum in the lab [um], shape [N + 1, 3] each.
+        directors: e1 of the motor tripod and of segments 1..N of each flagellum, shape [N + 1, 3] each.
+        body_position: centre of the body in the lab [um], shape [3].
+        body_orientation: quaternion (x, y, z, w) from body to lab axes, shape [4].
+        time: simulated time [s].
+        notes: what was changed of the scene's own shape so that it begins clear of body and other flagella, a line
+            each.
+        forms: of polymorphs at every node, shape [node_count]; None: all in the ground state.
     """
 
     positions: tuple[Array, ...]
@@ -61,10 +65,12 @@ class InitialState:
 def initial_state(scene: Scene) -> InitialState:
     """The scene's shape at time 0. The tripods start without twist of the hook joint.
 
-    Phases: an explicit phase of a flagellum stands. Else a flagellum starts at 180 deg, and with
-    phase_difference given those of odd number are shifted by the delta in [0, 180] deg at which flagella 0
-    and 1 have it. Raises SceneError where no such delta exists, and where a motor axis points against the
-    first segment, so that the hook joint is undefined.
+    A flagellum with an explicit phase has that. Others start at 180 deg, those of odd number shifted, where the scene
+    gives `flagella.phase_difference`, by the angle in [0, 180] deg at which flagella 0 and 1 have it.
+
+    Raises:
+        SceneError: no shift gives the phase difference, or a motor axis points against the first segment, so that the
+            hook joint is undefined.
     """
     shift = _phase_shift(scene)
     specs = [with_phase(spec, k, shift) for k, spec in enumerate(scene.resolved_flagella())]
@@ -72,9 +78,14 @@ def initial_state(scene: Scene) -> InitialState:
 
 
 def at_time_0(scene: Scene, shapes: Sequence[tuple[Array, Array]]) -> InitialState:
-    """The cell at the origin with these flagella: nodes, and e1 of segments 1..N; tripods without twist of the hook.
+    """The cell at the origin with given flagella, tripods without twist of the hook.
 
-    Raises SceneError where a motor axis points against the first segment.
+    Args:
+        scene: of the cell.
+        shapes: nodes [um], shape [N + 1, 3], and e1 of segments 1..N, shape [N, 3], of each flagellum.
+
+    Raises:
+        SceneError: a motor axis points against the first segment.
     """
     positions, directors = [], []
     for k, (spec, (nodes, e1)) in enumerate(zip(scene.resolved_flagella(), shapes, strict=True)):
@@ -85,14 +96,14 @@ def at_time_0(scene: Scene, shapes: Sequence[tuple[Array, Array]]) -> InitialSta
 
 
 def with_phase(spec: FlagellumSpec, k: int, shift: float) -> FlagellumSpec:
-    """Flagellum k with a phase [deg]: its own, or 180, plus ``shift`` if k is odd."""
+    """Flagellum k with a phase [deg]: its own, or 180, plus `shift` if k is odd."""
     return spec if spec.phase is not None else replace(spec, phase=DEFAULT_PHASE + shift * (k % 2))
 
 
 def phase_difference_at(scene: Scene, shift: float) -> float:
-    """Contour average of the phase difference of flagella 0 and 1, 1 being shifted by ``shift`` [deg].
+    """Contour average of the phase difference of flagella 0 and 1, in [0, 1], with 1 shifted by `shift` [deg].
 
-    Over the segments that both have; segments with antiparallel tangents are left out.
+    It is taken over the segments that both have; segments with antiparallel tangents are left out.
     """
     (nodes_a, e1_a), (nodes_b, e1_b) = (
         flagellum_at_rest(scene, with_phase(spec, k, shift)) for k, spec in enumerate(scene.resolved_flagella()[:2])
@@ -146,7 +157,7 @@ def flagellum_at_rest(scene: Scene, spec: FlagellumSpec) -> tuple[Array, Array]:
 
 
 def _phase_direction(axis: Array, phase: float) -> Array:
-    """Unit vector across ``axis`` at ``phase`` [deg] about it, counted from the lab x axis projected."""
+    """Unit vector across `axis` at `phase` [deg] about it, counted from the lab's x axis projected across it."""
     x = np.array([1.0, 0.0, 0.0])
     # Along x the projection vanishes; its limit for an axis tilted in the x-z plane is taken.
     reference = x if abs(axis[0]) < 1 - 1e-12 else np.array([0.0, 0.0, -axis[0]])
@@ -155,7 +166,7 @@ def _phase_direction(axis: Array, phase: float) -> Array:
 
 
 def _tripod(scene: Scene, k: int, spec: FlagellumSpec, e1: Array, edge: Array) -> Array:
-    """e1 of the motor tripod: segment 1's, carried onto the motor axis by the minimal rotation."""
+    """e1 of the motor tripod: that of segment 1 after the minimal rotation of its tangent onto the motor axis."""
     motor_axis = np.array(attachment.motor_axis(spec))
     tangent = edge / np.linalg.norm(edge)
     cosine = float(np.dot(tangent, motor_axis))

@@ -24,8 +24,8 @@ __all__ = ["BodyShell", "body_shell", "rotne_prager", "shell_mobility", "shells_
 
 LARGEST_ERROR = 0.01
 """Largest error of a drag that a fit may leave; the body of the default scene has 0.004 with 30 to 480 beads."""
-_ITERATIONS = 12  # of the fit, at most: bodies of aspect 1 to 10 with 60 to 240 beads take 4 to 7
-_DIGITS = 4  # of radius and depths over the half width: the same beads on every machine
+_FIT_ITERATIONS = 12  # of the fit, at most: bodies of aspect 1 to 10 with 60 to 240 beads take 4 to 7
+_FIT_DIGITS = 4  # of radius and depths over the half width: the same beads on every machine
 _HEXAGONAL = math.sqrt(3) / 2  # distance of rows over that of points in a row, of points packed most evenly
 
 
@@ -54,8 +54,8 @@ def rotne_prager(x: np.ndarray, a: float | np.ndarray, y: np.ndarray, b: float |
     """Rotne-Prager tensors of spheres of two radii, times 8 pi eta [1/um], shape [len(x), 3, len(y), 3].
 
     Args:
-        x, y: centres [um], shape [count, 3].
-        a, b: radii [um], one or one for each.
+        x, y: centres [um], shape [count, 3] each.
+        a, b: radii [um], a number or shape [count] each.
 
     Source:
         Zuk, Wajnryb, Mizerski & Szymczak, J. Fluid Mech. 741, R5 (2014).
@@ -126,7 +126,7 @@ def _rings(counts: tuple[int, ...], long: float, wide: float) -> np.ndarray:
 
 
 def _rigid_motion(x: np.ndarray) -> np.ndarray:
-    """K: velocities of points x for a velocity and a spin of the body, shape [count, 3, 6]."""
+    """K: velocities of points x [um] per velocity and spin of the body, shape [count, 3, 6]."""
     k = np.zeros((len(x), 3, 6))
     k[:, :, :3] = np.eye(3)
     for axis in range(3):
@@ -162,7 +162,7 @@ def _fit(counts: tuple[int, ...], length: float, width: float) -> tuple[float, n
     covering = math.sqrt(_area(long, wide) / (math.pi * count)) / wide
     numbers = covering * np.array([0.9, 0.27, 0.27])
     found = errors(numbers)
-    for _ in range(_ITERATIONS):
+    for _ in range(_FIT_ITERATIONS):
         small = 1e-4
         slopes = np.stack([(errors(numbers + small * axis) - found) / small for axis in np.eye(3)], axis=1)
         step = -np.linalg.lstsq(slopes, found, rcond=1e-6)[0]
@@ -177,9 +177,9 @@ def _fit(counts: tuple[int, ...], length: float, width: float) -> tuple[float, n
         else:
             break
         moved, numbers, found = float(np.abs(share * step).max()), tried, new
-        if moved < 10**-_DIGITS / 5:
+        if moved < 10**-_FIT_DIGITS / 5:
             break
-    numbers = np.round(numbers, _DIGITS)
+    numbers = np.round(numbers, _FIT_DIGITS)
     return float(np.abs(errors(numbers)).max()), numbers
 
 
@@ -240,7 +240,7 @@ def shells_of(scenes: Sequence[Scene]) -> Shells:
 def shell_mobility(scene: Scene) -> np.ndarray:
     """Mobility of the shell as a rigid body in body axes, from force and torque to velocity and spin, shape [6, 6].
 
-    A motion that a switch holds has none: what is left is the inverse of the resistance to the other motions.
+    A motion that a switch of the scene prevents has none: what is left is the inverse of the resistance to the others.
     """
     body = scene.body
     free = np.ones(6, dtype=bool)

@@ -12,19 +12,20 @@ from warpflag.scene import Scene, SceneError, attachment
 
 __all__ = ["check_outside", "shape_of_frame", "starting_state"]
 
-_MEAN_STRAIN = 0.01  # of a flagellum, beyond which a record is of one of another length
-_TENSION = 10.0  # pN; what may stretch a soft one by more
-_ANCHOR_TOLERANCE = 1e-3  # um; a record in float32 is off by less
+_MEAN_STRAIN = 0.01  # mean strain of a flagellum from which a record is taken to be of one of another length
+_TENSION = 10.0  # pN; tension that may stretch a soft filament by more than that
+_ANCHOR_TOLERANCE = 1e-3  # um; largest difference of anchors; a record in float32 is off by less
 
 
 def starting_state(scene: Scene) -> InitialState:
     """The shape that a scene asks for, at time 0.
 
-    Where the scene's own shape would begin inside the body or on another flagellum, it begins a little otherwise, see
-    `clear_start`; its notes say how.
+    Where the scene's own shape would begin inside the body or on another flagellum it is changed (`clear_start`); the
+    notes of the result say how.
 
-    Raises SceneError where `start.record` can't be read or holds another cell than the scene's, and where the scene's
-    own shape can't begin clear.
+    Raises:
+        SceneError: `start.record` can't be read or holds another cell than the scene's, or the scene's own shape can't
+            be made clear.
     """
     if scene.start.record is None:
         return clear_start(scene, initial_state(scene))

@@ -19,7 +19,7 @@ class Starts:
         self._found: dict[Scene, InitialState | SceneError] = {}
 
     def of(self, scene: Scene) -> InitialState:
-        """The start of a scene.
+        """The start of a scene; found once for scenes that differ only in settings that leave the shape alone.
 
         Raises:
             SceneError: it has none.

@@ -17,8 +17,8 @@ from warpflag.scene import Scene
 
 __all__ = ["corners", "second_intervals", "switch_times"]
 
-_SECOND_STREAMS = 1 << 40  # random numbers of motor k for its second form are those of the stream this many beyond
-_BEYOND = 2.0  # switches are drawn this many times beyond the scene's end, for a run that is advanced further
+_SECOND_STREAMS = 1 << 40  # offset of the random streams of second forms: motor k has stream k plus this
+_DRAWN_DURATIONS = 2.0  # scene durations for which switches are drawn, for a run that is advanced beyond its end
 
 
 def corners(scene: Scene, motor: int) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def switch_times(scene: Scene, motor: int) -> tuple[float, ...]:
     if scene.motor.switching == "schedule":
         return scene.resolved_flagella()[motor].switch_times
     m = scene.motor
-    return _markov(m.seed, motor, m.to_reverse, m.to_forward, m.coupling, _BEYOND * scene.duration)
+    return _markov(m.seed, motor, m.to_reverse, m.to_forward, m.coupling, _DRAWN_DURATIONS * scene.duration)
 
 
 def second_intervals(scene: Scene, motor: int) -> tuple[tuple[float, float], ...]:

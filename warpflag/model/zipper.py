@@ -33,7 +33,7 @@ _LAST_S = 12.0  # the open rest is then e^-12 of what it was: closed
 _STEPS = 240  # of Runge-Kutta in s, 0.05 each: its error is 2e-6 of the length
 _LARGEST = 700.0  # of y: its cosh is still finite
 _GRID = 13  # values of each parameter per round of the fit
-_ROUNDS = 30  # each halves the ranges: the valley of good fits is narrow and slanted
+_FIT_ROUNDS = 30  # each halves the ranges: the valley of good fits is narrow and slanted
 _BOUNDS = {"radius": (0.0, 5.0), "phase_velocity": (1.0, 1e4)}  # um, um/s: far beyond any bundle
 
 
@@ -75,10 +75,18 @@ of flagella of 8 um."""
 def zipping(record: Record, onset: float = 0.2) -> tuple[Array, Array]:
     """Times [s] and l_r while the zip closes: from where l_r last rises above `onset` to where it is complete.
 
-    Before, l_r jumps between 0 and short stretches that touch and part again. Complete: l_r >= 0.98 for 0.25 ms. l_r
-    passes over gaps of `observables.STRAY`.
+    Before, l_r jumps between 0 and short stretches that touch and part again. Complete means l_r >= 0.98 for 0.25 ms.
+    l_r passes over gaps of `observables.STRAY`.
 
-    Raises ValueError where the zip is never complete.
+    Args:
+        record: of the run.
+        onset: l_r at which the zip begins.
+
+    Returns:
+        Times from the frame at the onset on [s], shape [count], and l_r, same shape.
+
+    Raises:
+        ValueError: the zip is never complete.
     """
     times, lengths = record.times, recorded.bundle_lengths(record, gap=observables.STRAY)
     stop = observables.zip_time(times, lengths, hold=2.5e-4)
@@ -91,9 +99,15 @@ def zipping(record: Record, onset: float = 0.2) -> tuple[Array, Array]:
 
 
 def measured(record: Record, start: float, stop: float) -> Zipper:
-    """The model with the parameters of a run, measured from `start` to `stop` [s]; R and l_r(0) are 0.
+    """The model with the parameters of a run, measured over a window; R and l_r(0) are 0.
 
-    L_ax: of the flagella at rest. v_e: pitch times rate of the helices in the lab. v_c: along the body axis.
+    L_ax is that of the flagella at rest, v_e pitch times rate of the helices in the lab, v_c the speed along the body
+    axis.
+
+    Args:
+        record: of the run.
+        start: of the window [s].
+        stop: of the window [s].
     """
     scene = loads(record.scene_text)
     swimming = recorded.swimming(record, start, stop)
@@ -118,9 +132,10 @@ def _angle_between_axes(a: FlagellumSpec, b: FlagellumSpec) -> float:
 
 
 def bundle_length(zipper: Zipper, times: Array) -> Array:
-    """l_r over L_ax at the given times [s], shape [count]; 1 once closed.
+    """l_r over L_ax at the given times [s], shape [count]; 1 once the zip is closed.
 
-    Raises ValueError where the front does not move forward, or starts beyond the tips.
+    Raises:
+        ValueError: the front does not move forward, or starts beyond the tips.
     """
     times_of_front, front = _solved(zipper, zipper.phase_velocity, zipper.radius, zipper.start)
     return np.interp(times, times_of_front[0], front[0]) / zipper.axial_length
@@ -147,17 +162,23 @@ def fit(
 ) -> Fit:
     """Adjusts R and l_r(0) by least squares, as the paper does, or v_e and l_r(0); all else stays as given.
 
-    times: from the moment at which the model starts [s], shape [count]. lengths: l_r over L_ax, same shape. A grid over
-    both parameters, narrowed about its best point round by round. R is sought from 0 to 5 um, v_e from 1 to 1e4 um/s; a
-    result on a bound says that the model has no better one inside.
+    A grid over both parameters is narrowed about its best point round by round. R is sought from 0 to 5 um, v_e from 1
+    to 1e4 um/s; a result on a bound means that the model has no better one inside.
 
-    Raises ValueError where the front can't move forward.
+    Args:
+        zipper: the parameters that stay.
+        times: from the moment at which the model starts [s], shape [count].
+        lengths: l_r over L_ax, same shape.
+        adjust: which parameter is adjusted beside l_r(0).
+
+    Raises:
+        ValueError: the front can't move forward.
     """
     times, lengths = np.asarray(times, float), np.asarray(lengths, float)
     least = low = np.array([_BOUNDS[adjust][0], 0.0])
     most = high = np.array([_BOUNDS[adjust][1], 0.999 * zipper.axial_length])
     best, residual = low, math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(_FIT_ROUNDS):
         first, start = (axis.ravel() for axis in np.meshgrid(*np.linspace(low, high, _GRID).T))
         velocity, radius = (first, zipper.radius) if adjust == "phase_velocity" else (zipper.phase_velocity, first)
         curves = zip(*_solved(zipper, velocity, radius, start), strict=True)

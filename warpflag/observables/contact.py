@@ -62,7 +62,7 @@ def closest_parameters(p: Array, d: Array, q: Array, e: Array) -> tuple[Array, A
 
 
 def own_spacing(diameter: float, segment_length: float) -> int:
-    """How many numbers two segments of one flagellum must be apart to touch: 2, and more than 3 sigma of contour.
+    """Least difference of the numbers of two segments of one flagellum that can touch: 2, and 3 sigma of contour.
 
     Args:
         diameter: sigma [um].
@@ -85,7 +85,7 @@ def steric_force_density(
 
     Every pair of segments of two flagella, or of one where that is in contact with itself, within the cutoff acts, by
     (1 - s) on its first and s on its second node. The rules: "pairs" sums |F| over the pairs, each once, so a contact
-    near a vertex counts up to four times (records hold this one); "nodes" sums the magnitudes of the forces on the
+    near a node counts up to four times (records hold this one); "nodes" sums the magnitudes of the forces on the
     nodes of a flagellum, in which forces from opposite sides cancel; "net" is the magnitude of the summed force on a
     flagellum. The last two are means over the flagella. None of them converges with the segment length: compare shapes,
     not values.

@@ -38,7 +38,7 @@ while it is written, and one whose writer was killed can't be opened again."""
 
 _CHUNK_BYTES = 1 << 20  # of a chunk: HDF5's cache of chunks holds one
 _FRAMES_OF_CHUNK = (16, 64)  # at least and at most
-_NUMBERS = itertools.count()
+_RECORD_NUMBERS = itertools.count()
 _MEMORY_BLOCK = 4096  # bytes by which a file in memory grows
 _SLACK_BYTES = 4096  # what HDF5 allocates ahead for small things
 _TREE_FANOUT = 64  # chunks in a node of HDF5's tree of chunks
@@ -192,7 +192,7 @@ def _in_memory(image: bytes | None = None) -> Any:
     import h5py
     from h5py import h5f, h5p  # pyright: ignore[reportAttributeAccessIssue]
 
-    name = f"record {next(_NUMBERS)}"  # HDF5 takes files of one name for one file, also those of other threads
+    name = f"record {next(_RECORD_NUMBERS)}"  # HDF5 takes files of one name for one file, also those of other threads
     if image is None:
         return h5py.File(name, "w", libver=FORMAT, driver="core", backing_store=False, block_size=_MEMORY_BLOCK)
     access = h5p.create(h5p.FILE_ACCESS)

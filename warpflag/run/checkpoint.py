@@ -26,7 +26,7 @@ __all__ = ["CheckpointError", "exists", "load", "name", "save", "write"]
 _TEMPORARY = "checkpoint.tmp"
 
 LONGEST_ZIP = 1 << 31  # bytes: what is longer needs another format of zip
-_KEPT = 2  # the newest, and one to fall back to where that is damaged
+_CHECKPOINTS_KEPT = 2  # the newest, and one to fall back to where that is damaged
 _NAME = re.compile(r"checkpoint-(\d+)\.npz")
 
 
@@ -89,7 +89,7 @@ def name(directory: str | Path, sync: bool = False) -> Path:
     numbered = _numbered(directory)
     path = directory / f"checkpoint-{numbered[-1][0] + 1 if numbered else 0:06d}.npz"
     os.replace(directory / _TEMPORARY, path)
-    for _, old in numbered[: len(numbered) + 1 - _KEPT]:
+    for _, old in numbered[: len(numbered) + 1 - _CHECKPOINTS_KEPT]:
         old.unlink(missing_ok=True)
     return path
 

@@ -50,8 +50,8 @@ _ADVICE = {
 }
 _OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE, Fault.CROWDED)
 """Faults of a cell as a whole: no segment is to blame."""
-_NOTABLE = 3.0  # a value this many times from the default is named: factors of two are ordinary choices
-_EXTERNAL = 1.0  # weight of a force from outside among the causes, that of a value e times its default
+_NOTABLE_VALUE = 3.0  # a value that is off its default by this factor is named: factors of two are ordinary choices
+_EXTERNAL_WEIGHT = 1.0  # weight of an external force among the causes: that of a value e times its default
 _CROWDED = 3.0  # anchors nearer than so many diameters are named
 
 
@@ -86,7 +86,7 @@ def likely_causes(scene: Scene) -> list[str]:
     found = []
     for key, value in given.items():
         ratio = value / usual[key]
-        if ratio <= 0.0 or 1 / _NOTABLE < ratio < _NOTABLE:
+        if ratio <= 0.0 or 1 / _NOTABLE_VALUE < ratio < _NOTABLE_VALUE:
             continue
         much = f"{ratio:.3g} times" if ratio > 1 else f"1/{1 / ratio:.3g} of"
         found.append((abs(math.log(ratio)), f"{key} = {value:g}, {much} the default"))
@@ -95,7 +95,7 @@ def likely_causes(scene: Scene) -> list[str]:
         if diameters < _CROWDED:
             found.append((math.log(_CROWDED / diameters) + 1.0, f"anchors {apart:.3g} um apart crowd the flagella"))
     pulls = [(field.name, getattr(scene.external, field.name)) for field in dataclasses.fields(scene.external)]
-    found += [(_EXTERNAL, f"external.{name} = {value}") for name, value in pulls if np.any(np.asarray(value))]
+    found += [(_EXTERNAL_WEIGHT, f"external.{name} = {value}") for name, value in pulls if np.any(np.asarray(value))]
     if scene.start.record is not None:
         found.append((0.0, "start.record, made with another scene"))
     return [words for _, words in sorted(found, key=lambda one: -one[0])]

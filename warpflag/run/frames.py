@@ -24,7 +24,7 @@ from warpflag.stepping import Stepper, System
 
 __all__ = ["Frames", "finite_time", "one_by_one"]
 
-_NEVER = 1e9  # [s]; finite, since fixed steps divide what is left of the time
+_FAR_FUTURE = 1e9  # [s]; finite, since fixed steps divide what is left of the time
 _ROUNDING = 1e-6  # of a frame interval: times this close are the same
 # What rates are differences of; it is kept of the last frame of every cell.
 _MOTION = ("time", "body_position", "body_orientation", "body_angle", "motor_angle")
@@ -138,7 +138,7 @@ class Frames:
                 array.assign(memory[f"before_{name}"])
 
     def pass_by(self, times: np.ndarray) -> None:
-        """Frames up to these times [s] are behind the cells, although nobody wanted them."""
+        """Counts frames up to these times [s] as past, though they were not recorded."""
         begun = self.index >= 0
         behind = np.floor(times / self._durations * self._counts + _ROUNDING).astype(np.int64)
         self.index = np.where(begun, np.maximum(self.index, behind), -1)
@@ -183,7 +183,7 @@ class Frames:
         """Where steps of each cell end [s]: at `until`, at frames only if the stepper has to, shape [cell_count]."""
         if self._end_steps:
             return np.where(self._scheduled > 0, self._wanted[:, 0], 0.0)
-        beyond = np.full(len(self._ends), _NEVER) if until is None else np.maximum(self._ends, until)
+        beyond = np.full(len(self._ends), _FAR_FUTURE) if until is None else np.maximum(self._ends, until)
         return np.where(self._scheduled > 0, beyond, 0.0)
 
     def collect(self, until: float | None, waiting: np.ndarray, times: np.ndarray) -> list[dict[int, FrameRows]]:

@@ -115,19 +115,19 @@ def settings_sha256(scene: Scene, text: str | None = None, defaults: str | None 
         defaults: the scene of defaults alone as TOML; None: this version's.
     """
     values = settings_of(scene, text)
-    default = _default_settings() if defaults is None else settings_of(_DEFAULT, defaults)
+    default = _default_settings() if defaults is None else settings_of(_DEFAULT_SCENE, defaults)
     default = {**default, "name": values["name"]}
     lines = [f"{key} = {value}" for key, value in values.items() if value != default.get(key, "none")]
     chosen = sorted(line for line in lines if line.partition(" ")[0] not in _NOT_OF_THE_MOTION)
     return hashlib.sha256("\n".join(chosen).encode()).hexdigest()
 
 
-_DEFAULT = Scene(name="default")
+_DEFAULT_SCENE = Scene(name="default")
 
 
 @functools.cache
 def _default_settings() -> dict[str, str]:
-    return settings_of(_DEFAULT)
+    return settings_of(_DEFAULT_SCENE)
 
 
 def is_of_scene(meta: Mapping[str, Any], scene: Scene, texts: Iterable[str]) -> bool:

@@ -1,14 +1,12 @@
-"""The driver: scenes in, frames out. It captures one pass of the stepper, replays it, and watches the guards."""
+"""The driver: scenes in, frames out. It has a stepper advance the cells, and watches the guards."""
 
 from __future__ import annotations
 
 import math
-import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 from warpflag_kernels.base import clock as control_stage
 from warpflag_kernels.base.plan import Plan
 from warpflag_kernels.rod import reconstruction
@@ -31,10 +29,10 @@ from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames, finite_time, one_by_one
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
+from warpflag.stepping.replay import Replay
 
 __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
-_SECONDS_PER_REPLAY = 0.2  # between two looks from the host: signals are answered that fast, and a look costs 1e-5 s
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
 
 
@@ -86,8 +84,8 @@ class Simulation:
         self.first_node = model.data.first_node.numpy()
         self._first_flagellum = model.data.first_flagellum.numpy()
         self.reporters = list(reporters)
-        self._capture, self._graph = capture, None
-        self._checked, self._loaded, self._passes_per_replay = False, False, 200
+        self._replay = Replay(self.system.control, self.stepper, self.device, capture)
+        self._checked, self._loaded = False, False
         self._frames = Frames(self.system, self.scenes)
         self._reader = CellsReader(self.system)
         self._excluded = np.zeros(len(self.scenes), dtype=bool)
@@ -173,8 +171,8 @@ class Simulation:
             watch: as in `advance`.
 
         Returns:
-            An iterator over blocks: the next frames of each cell that has any, by cell; then those after them. A block
-            may be empty, since the host also looks a few times a second.
+            An iterator over blocks: the next frames of each cell that has any, by cell; then those after them; and so
+            on. A block may be empty, since the host also reads the slots a few times a second.
         """
         until = None if until is None else finite_time(until)
         self.prepare(recording=True)
@@ -211,11 +209,7 @@ class Simulation:
         self.load(recording, quiet)
         if not self._checked:
             self._check_start()
-        if not self._capture or self._graph is not None:
-            return
-        with wp.ScopedCapture(device=self.device) as captured:
-            wp.capture_while(self.system.control.proceed, self.stepper.launch_pass)
-        self._graph = captured.graph
+        self._replay.prepare()
 
     @alone
     def load(self, recording: bool = False, quiet: bool = False) -> None:
@@ -229,7 +223,8 @@ class Simulation:
     def _take_frames(self) -> None:
         """Has the stepper take frames; a pass that was captured without is captured anew."""
         self._frames.take_from(self.stepper)
-        self._graph, self._loaded = None, False
+        self._replay.forget()
+        self._loaded = False
 
     def _launch_all(self) -> None:
         """Launches whatever a run launches, to find its kernels."""
@@ -268,22 +263,7 @@ class Simulation:
             state.active.assign(waiting.astype(np.int32))
             control.rest.zero_()
             control.unfinished.fill_(int(waiting.sum()))
-        began = clock.perf_counter()
-        while control.unfinished.numpy()[0] > 0:
-            with LAUNCHING:
-                control.budget.fill_(self._passes_per_replay)
-                control.proceed.fill_(1)
-            started = clock.perf_counter()
-            self._replay()
-            done = control.budget.numpy()[0] <= 0
-            if done:  # a full replay: aim at a fixed wall time between two looks from the host
-                per_pass = (clock.perf_counter() - started) / self._passes_per_replay
-                self._passes_per_replay = int(np.clip(_SECONDS_PER_REPLAY / per_pass, 20, 1_000_000))
-            if clock.perf_counter() - began > seconds:
-                with LAUNCHING:
-                    control.rest.fill_(1)
-            if watch is not None:
-                watch()
+        self._replay.advance(watch, seconds)
 
     @property
     def faults(self) -> dict[int, NumericalError]:
@@ -360,14 +340,6 @@ class Simulation:
         cell = range(len(self.scenes))[cell]
         flagella = slice(self._first_flagellum[cell], self._first_flagellum[cell + 1])
         return flagella, slice(self.first_node[flagella.start], self.first_node[flagella.stop])
-
-    def _replay(self) -> None:
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-            return
-        with LAUNCHING:
-            while self.system.control.proceed.numpy()[0] > 0:
-                self.stepper.launch_pass()
 
     def _reconstruct(self) -> None:
         """Puts the evaluation point on the present state; every cell is active afterwards."""

@@ -22,8 +22,8 @@ SYNCHRONISED = 0.15
 
 
 _OBSERVABLES = "observables/"
-_NOTABLE = 2.0
-"""A worst window is told where it is this many times the mean and what was asked."""
+_NOTABLE_WINDOW = 2.0
+"""The worst window is told where its estimate is more than this many times the mean, and what was asked."""
 
 
 def digest(record: Record, scene: Scene, kept: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def accuracy_kept(scene: Scene, checkpoint: Mapping[str, np.ndarray]) -> dict[st
         return facts
     ends = own["worst_end"] if found[1] == own["worst"] else float(checkpoint["control.time"][0])
     facts |= {"estimate": asked * found[0], "worst_window": asked * found[1], "worst_window_end": ends}
-    facts["beyond"] = accuracy.last_span(own, independent) > accuracy.BEYOND
+    facts["beyond"] = accuracy.last_span(own, independent) > accuracy.LARGEST_EXCESS
     return facts | {"steps_at_shortest": int(own["at_shortest"])}
 
 
@@ -89,7 +89,7 @@ def kept_words(facts: Mapping[str, Any]) -> str:
         return ""
     mean, worst = facts["estimate"] / facts["asked"], facts["worst_window"] / facts["asked"]
     words = f"error estimate {mean:.2g} times the {facts['asked']:g} um/ms asked for"
-    if worst > max(_NOTABLE, _NOTABLE * mean):
+    if worst > max(_NOTABLE_WINDOW, _NOTABLE_WINDOW * mean):
         words += f" (worst {worst:.2g} times, just before {1e3 * facts['worst_window_end']:.4g} ms)"
     if facts["steps_at_shortest"]:
         words += f", {facts['steps_at_shortest']} steps as short as estimates may ask for"

@@ -22,7 +22,7 @@ BEFORE_FORMATS: dict[str, Any] = {
 }
 """The paper's model, by dotted key: the values of these settings in a file that has no format and leaves them out."""
 
-_SECTIONS = {"hydrodynamics": Hydrodynamics, "hook": Hook}
+_FORMAT_SECTIONS = {"hydrodynamics": Hydrodynamics, "hook": Hook}
 
 
 def paper_scene(name: str, **settings: Any) -> Scene:
@@ -39,7 +39,7 @@ def paper_scene(name: str, **settings: Any) -> Scene:
         SceneError: the scene can't be simulated.
     """
     sections = {}
-    for section, cls in _SECTIONS.items():
+    for section, cls in _FORMAT_SECTIONS.items():
         own = {key.partition(".")[2]: value for key, value in BEFORE_FORMATS.items() if key.startswith(f"{section}.")}
         sections[section] = dataclasses.replace(cls(), **own)
     return Scene(name, **{**sections, **settings})

@@ -28,11 +28,15 @@ _STRAIGHT = 1e-9  # um; a helix of smaller radius has no direction from its axis
 class DiscreteHelix:
     """The zero-energy shape of a discrete rod: every joint turns the frame by the same rotation.
 
-    Everything is in the axes (e1, e2, e3) of the first segment. joint: that rotation, columns are the next
-    segment's axes, shape [3, 3]; axis: unit axis of the helix, along which the nodes advance, shape [3];
-    angle: turn about it per joint [rad], negative for a left-handed helix; rise: advance per segment [um];
-    radius: of the nodes [um]; outward: unit vector from the axis to the first node, shape [3] (e1 for a
-    straight rod, which has none).
+    All of it is in the axes (e1, e2, e3) of the first segment.
+
+    Attributes:
+        joint: the rotation of a joint; its columns are the next segment's axes, shape [3, 3].
+        axis: unit vector of the helix axis, along which the nodes advance, shape [3].
+        angle: turn about the axis per joint [rad], negative for a left-handed helix.
+        rise: advance along the axis per segment [um].
+        radius: of the nodes [um].
+        outward: unit vector from the axis to the first node, shape [3]; e1 for a straight rod, which has none.
     """
 
     joint: Array
@@ -51,12 +55,20 @@ class DiscreteHelix:
 def ground_state(strain: tuple[float, float, float], segment_length: float) -> DiscreteHelix:
     """Discrete helix on which every joint has exactly the intrinsic strain.
 
-    strain: (Omega_1, Omega_2, Omega_3) [1/um]; segment_length: h [um]. Discrete elastic rods (Bergou et al.
-    2008): between segments e and f with curvature binormal kb = 2 t_e x t_f / (1 + t_e.t_f), the strains are
-    h Omega_1 = kb.(e1_e + e1_f)/2, h Omega_2 = kb.(e2_e + e2_f)/2, and h Omega_3 is the twist from e1_e,
-    parallel-transported onto f, to e1_f. Since transport keeps the components of kb, the first two are
-    cos(twist/2) times kb turned by twist/2, which is inverted here: |kb| = h |(Omega_1, Omega_2)| /
-    cos(twist/2). Raises ValueError unless |h Omega_3| < pi.
+    Between segments e and f with curvature binormal kb = 2 t_e x t_f/(1 + t_e.t_f) the strains are h Omega_1 = kb.(e1_e
+    + e1_f)/2, h Omega_2 = kb.(e2_e + e2_f)/2, and h Omega_3 is the twist from e1_e, parallel-transported onto f, to
+    e1_f. Transport keeps the components of kb, so the first two are cos(twist/2) times kb turned by twist/2. That is
+    inverted here: |kb| = h |(Omega_1, Omega_2)|/cos(twist/2).
+
+    Args:
+        strain: (Omega_1, Omega_2, Omega_3) [1/um].
+        segment_length: h [um].
+
+    Raises:
+        ValueError: the twist per joint, h Omega_3, is not below pi in magnitude.
+
+    Source:
+        discrete elastic rods, Bergou et al., ACM Trans. Graph. 27, 63 (2008).
     """
     bend_1, bend_2, twist = (segment_length * component for component in strain)
     if not abs(twist) < math.pi:
@@ -182,14 +194,14 @@ def joint_strain(tangents: Array, directors: Array) -> Array:
 
 
 def across(axis: Array, outward: Array) -> tuple[Array, Array]:
-    """Two unit vectors across ``axis``: ``outward`` made perpendicular to it, and axis x that."""
+    """Two unit vectors across the unit vector `axis`: `outward` made perpendicular to it, and axis x that."""
     first = outward - np.dot(outward, axis) * axis
     first /= np.linalg.norm(first)
     return first, np.cross(axis, first)
 
 
 def rotation_matrix(axis: Array, angle: float | Array) -> Array:
-    """Rotation about a unit axis by ``angle`` [rad], shape [..., 3, 3] for angles of shape [...]."""
+    """Rotation matrices about a unit axis by `angle` [rad], shape [..., 3, 3] for angles of shape [...]."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine, half = np.sin(angle)[..., None, None], np.sin(np.asarray(angle) / 2)[..., None, None]

@@ -29,7 +29,7 @@ __all__ = [
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _PRINTED = (1.6e-3, 2.8e-3, 1.26e-6)  # gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s] of the paper
 _ZETA_3 = 1.2020569031595942  # sum of 1/n^3 over n = 1, 2, ...
-_SOUND = 1 - 1e-9  # round-off of the condition that a pair radius was chosen by
+_NEARLY_ONE = 1 - 1e-9  # share of the least pair radius that is enough: it may have been chosen by equality
 _BOLTZMANN = 1.380649e-5  # pN um/K, exact
 
 
@@ -140,7 +140,7 @@ def _check_given(scene: Scene, given: float) -> None:
     def sound(a_pair: float) -> bool:
         if mode == "consistent":
             return all(_positive(h, radius, a_pair) for h in lengths)
-        return a_pair >= _SOUND * _least_radius(scene, max(lengths))
+        return a_pair >= _NEARLY_ONE * _least_radius(scene, max(lengths))
 
     if mode not in ("all", "within", "consistent") or sound(given):
         return
@@ -196,7 +196,7 @@ def _drag(scene: Scene) -> tuple[float, float, float]:
 
 
 def pace(scene: Scene) -> float:
-    """How many times as fast as with the paper's drag in water a flagellum moves under given forces."""
+    """Largest ratio of the paper's drag in water to the scene's: how much faster a flagellum moves than in water."""
     found = zip((*_drag(scene), scene.fluid.viscosity), (*_PRINTED, _WATER), strict=True)
     return max(printed / value for value, printed in found)
 

@@ -15,6 +15,7 @@ from typing import Any
 from warpflag.base.above import method_from
 from warpflag.scene import attachment
 from warpflag.scene.errors import Problems, SceneError
+from warpflag.scene.run_sections import Numerics, Start
 from warpflag.scene.sections import (
     Body,
     External,
@@ -24,9 +25,7 @@ from warpflag.scene.sections import (
     Hook,
     Hydrodynamics,
     Motor,
-    Numerics,
     Polymorphs,
-    Start,
     Steric,
 )
 from warpflag.scene.settings import Section, integer, number, switch, text

@@ -18,9 +18,9 @@ __all__ = ["flattened", "nearest", "parsed", "read_overrides", "read_toml", "sec
 
 # Beyond any sensible scene, and below what the parser of TOML takes much time or memory for. Ten thousand flagella
 # with every key of their own, as `dumps` writes them, are 3 MB.
-_MOST_BYTES = 4 * 2**20
+_LARGEST_FILE = 4 * 2**20
 _LONGEST_QUOTE = 80  # characters of a line that an error shows: a line of a terminal
-_DEEPEST = 16  # levels of arrays, inline tables and dotted keys: a scene has four
+_DEEPEST_NESTING = 16  # levels of arrays, inline tables and dotted keys: a scene has four
 _MOST_DIGITS = 1000  # of a number: far beyond any float, and few enough for the parser's quadratic time
 
 # Strings, also those without an end, and comments: what looks like brackets or dots there is none.
@@ -30,7 +30,7 @@ _STRING = re.compile(
     re.DOTALL,
 )
 _BRACKET = re.compile(r"[\[\]{}]")
-_LONG_DOTTED_KEY = re.compile(rf"(?<![\w-])[\w-]++(?:[ \t]*+\.[ \t]*+[\w-]++){{{_DEEPEST}}}")
+_LONG_DOTTED_KEY = re.compile(rf"(?<![\w-])[\w-]++(?:[ \t]*+\.[ \t]*+[\w-]++){{{_DEEPEST_NESTING}}}")
 _LONG_NUMBER = re.compile(rf"(?<!\w)(?:0[xob])?[\da-fA-F_]{{{_MOST_DIGITS}}}")
 
 
@@ -48,7 +48,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             problem = "can't be read: it is not a regular file"
         else:
             with path.open("rb") as file:
-                content = file.read(_MOST_BYTES + 1)
+                content = file.read(_LARGEST_FILE + 1)
             _refuse_size(len(content))
             return parsed(content.decode("utf-8-sig"))
     except SceneError as error:
@@ -94,8 +94,8 @@ def _line_of(toml: str, message: str) -> str:
 
 
 def _refuse_size(size: int) -> None:
-    if size > _MOST_BYTES:
-        raise SceneError(None, None, f"is larger than {_MOST_BYTES // 2**20} MiB, which no scene needs")
+    if size > _LARGEST_FILE:
+        raise SceneError(None, None, f"is larger than {_LARGEST_FILE // 2**20} MiB, which no scene needs")
 
 
 def _refuse_extremes(toml: str) -> None:
@@ -105,10 +105,10 @@ def _refuse_extremes(toml: str) -> None:
     depth = 0
     for bracket in _BRACKET.finditer(bare):
         depth = depth + 1 if bracket[0] in "[{" else max(depth - 1, 0)
-        if depth > _DEEPEST:
-            raise SceneError(None, None, f"has arrays or tables nested more than {_DEEPEST} deep")
+        if depth > _DEEPEST_NESTING:
+            raise SceneError(None, None, f"has arrays or tables nested more than {_DEEPEST_NESTING} deep")
     if _LONG_DOTTED_KEY.search(bare):
-        raise SceneError(None, None, f"has a dotted key of more than {_DEEPEST} parts")
+        raise SceneError(None, None, f"has a dotted key of more than {_DEEPEST_NESTING} parts")
     if _LONG_NUMBER.search(bare):
         raise SceneError(None, None, f"has a number or key of {_MOST_DIGITS} digits or more")
 

@@ -1,4 +1,6 @@
-"""The sections of a scene: a frozen dataclass for each, with a declaration for every setting.
+"""The sections of a scene that say what is simulated: a frozen dataclass each, a declaration for every setting.
+
+`warpflag.scene.run_sections` has those that say how it is run.
 
 Units are um, pN and s throughout (so pN um for torques, pN s/um^2 for viscosity); angles are in degrees.
 Defaults are those of Adhyapak & Stark, Phys. Rev. E 92, 052701 (2015), "the paper", wherever it prints a
@@ -12,19 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, text, vector
+from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, vector
 from warpflag.scene.smooth_helix import inscribed_strain, smooth_strain
 
 FORMS = ("semicoiled", "curly_1", "coiled")
 """Forms of a filament that have names, beside that of its ground state."""
 
 MOTOR_LAWS = ("constant", "torque_speed", "rate")
-
-
-ACCURACY_LEVELS = {"draft": 5e-2, "standard": 5e-3, "careful": 5e-4}
-"""Node error per simulated ms that the words for `numerics.accuracy` ask for [um]."""
-SHORT_PAIRS_IN, SHORT_PAIRS_FROM = ("draft", "standard"), 1000
-"""Levels, and numbers of segments, at which flows of pairs in float32 save a good part of a step and change nothing."""
 
 
 @dataclass(frozen=True)
@@ -334,67 +330,3 @@ class External(Section, key="external"):
     body_force: tuple[float, float, float] = vector(
         (0.0, 0.0, 0.0), "pN", -1e4, 1e4, "force on the body, at its centre"
     )
-
-
-@dataclass(frozen=True)
-class Numerics(Section, key="numerics"):
-    """How time is stepped: numerical method, step and precision."""
-
-    stepper: str = choice(
-        "implicit",
-        ("euler", "rkc", "implicit"),
-        "explicit Euler, stabilised explicit Runge-Kutta-Chebyshev, or linearly implicit",
-    )
-    time_step: float | None = number(
-        None,
-        "s",
-        1e-14,
-        1e-2,
-        "fixed step, not above the duration",
-        derived="from numerics.accuracy; euler: just below its stability limit",
-    )
-    precision: str = choice("float64", ("float64", "float32"), "floating point numbers of forces and positions")
-    accuracy: float | str | None = number(
-        None,
-        "um",
-        1e-9,
-        1,
-        "wanted node error per simulated ms; draft: 5e-2, standard: 5e-3, careful: 5e-4",
-        choices=tuple(ACCURACY_LEVELS),
-        derived="5e-3, but euler takes fixed steps",
-    )
-    on_accuracy: str = choice(
-        "stop", ("stop", "warn"), "what happens when error estimates are beyond ten times the accuracy"
-    )
-    pair_precision: str | None = choice(
-        None,
-        ("same", "float32"),
-        "numbers of the flow of one pair; float32: those alone, added up in numerics.precision",
-        derived="same; float32 with accuracy draft or standard (the words) from a thousand segments on",
-    )
-
-    @property
-    def asked(self) -> float:
-        """Node error per simulated ms that steps are to keep [um]."""
-        given = "standard" if self.accuracy is None else self.accuracy
-        return ACCURACY_LEVELS[given] if isinstance(given, str) else given
-
-    def short_pairs(self, segments: int) -> bool:
-        """Whether flows of pairs are taken in float32 in a run in float64, with so many segments."""
-        wanted = self.pair_precision == "float32"
-        if self.pair_precision is None:
-            wanted = self.accuracy in SHORT_PAIRS_IN and segments >= SHORT_PAIRS_FROM
-        return wanted and self.precision == "float64"
-
-
-@dataclass(frozen=True)
-class Start(Section, key="start"):
-    """Where the run starts: from the scene's own shape, or from a frame of a record.
-
-    A record gives the shape of the flagella, their phases and the body's pose; phases of the scene are then unused.
-    """
-
-    record: str | None = text(
-        None, "run directory or run.h5, from the working directory", derived="the scene's own shape"
-    )
-    frame: int = integer(-1, -1, 10**9, "frame of the record; -1 is the last")

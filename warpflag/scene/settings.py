@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 from warpflag.scene.errors import Problems, SceneError, shown
 
 ABSENT = "absent"
-"""What takes a value away in place of one, in a sweep or on the command line."""
+"""Given in place of a value, in a sweep or on the command line, it takes the value away."""
 # What a number far out of range was probably typed in, the SI unit first:
 # {unit: (plural, ((other unit, factor), ...))}.
 UNIT_SLIPS: dict[str, tuple[str, tuple[tuple[str, float], ...]]] = {

@@ -71,7 +71,7 @@ class Scratch:
         free: solution of an iteration before the contact forces are solved for.
         solved: the same with the contact forces.
         total: the whole step.
-        remaining: what of the step is left to go from the second pose.
+        remaining: increment from the second pose to the end of the step.
     """
 
     predicted: Any
@@ -102,7 +102,7 @@ class ImplicitStepper:
     Attributes:
         data: the struct `Implicit`.
         steps: the struct `StepControl`.
-        balance: the struct `Balance`: the power balance of every step is asked for.
+        balance: the struct `Balance`: the power balance that every step must keep.
         stability: the struct `Stability`; None where nodes cause no flows.
         history: increments of the last two steps.
         stiffness, band, flow: structs `Stiffness`, `Band`, `StepFlow`, of the pose that was linearised last.
@@ -257,7 +257,7 @@ class ImplicitStepper:
 
     def restart(self) -> None:
         counts = np.diff(self._system.model.data.first_flagellum.numpy())
-        self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST))
+        self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST_OVER_IMPLICIT))
         self.data.history.zero_()
         self.data.share.zero_()
         self.balance.known.zero_()

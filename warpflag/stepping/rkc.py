@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from warpflag_kernels.base import clock
 from warpflag_kernels.rod import comoving_chart, reconstruction
-from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays, terms
+from warpflag_kernels.stepping import dense_output, evaluation_time, health, rkc, rkc_arrays, rkc_estimate, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
 
@@ -40,12 +40,12 @@ def euler_step(scene: Scene) -> float:
 
 
 class RkcStepper:
-    """RKC2 with a spectral radius followed by the power method; with `euler` one stage and no probe.
+    """RKC2, its spectral radius measured by a nonlinear power method; explicit Euler has one stage and measures none.
 
     Args:
         system: what to advance.
         scenes: one per cell; `numerics.time_step` fixes the step, else `numerics.accuracy` controls it.
-        euler: explicit Euler, the oracle.
+        euler: explicit Euler in place of RKC2.
     """
 
     def __init__(self, system: System, scenes: Sequence[Scene], euler: bool) -> None:
@@ -80,7 +80,7 @@ class RkcStepper:
         health.check(s.model, s.state, s.chart, s.guard, s.control)
         if not self._euler:
             comoving_chart.increment_rates(s.model, s.state, s.chart)
-            rkc.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
+            rkc_estimate.judge(s.model, s.state, s.chart, s.control, self.steps, self.data)
         if self.dense is not None:
             dense_output.take(s.model, s.state, s.chart, s.control, self.dense, counted=False)
         comoving_chart.commit(s.model, s.state, s.chart)

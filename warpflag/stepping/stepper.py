@@ -14,7 +14,7 @@ from warpflag_kernels.stepping.frame_slots import DenseOutput
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import pace
-from warpflag.scene.sections import ACCURACY_LEVELS
+from warpflag.scene.run_sections import ACCURACY_LEVELS
 
 __all__ = [
     "DEFAULT_ACCURACY",
@@ -42,7 +42,7 @@ class System:
     guard: Any
 
     def carried(self) -> dict[str, Any]:
-        """Arrays that go from step to step, by name; beside them only what the stepper and the frames remember."""
+        """Arrays, by name, that carry over from step to step, beside those of the stepper and of the frames."""
         control, chart = self.control, self.chart
         carried = {"control.time": control.time, "control.steps": control.steps}
         carried |= {f"chart.base_{name}": getattr(chart.base, name) for name in _POSE}
@@ -60,8 +60,13 @@ FIRST_STEP = 1.0e-8
 
 
 def restart_step_control(c: Any, fixed_start: np.ndarray) -> None:
-    """Forgets the estimates; the first step is `FIRST_STEP` under control, in thin fluids less, `fixed_start` [s]
-    otherwise."""
+    """Forgets the estimates of earlier steps and sets the first step.
+
+    Args:
+        c: struct `StepControl`.
+        fixed_start: first step of cells with fixed steps [s], shape [cell_count]. Under control it is `FIRST_STEP`,
+            shorter in thin fluids.
+    """
     c.error_sum.zero_()
     c.error_time.zero_()
     c.rejected_error.zero_()
@@ -88,7 +93,7 @@ def step_memory(steps: Any) -> dict[str, np.ndarray]:
 
 
 def recalled(steps: Any, memory: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Takes back what `step_memory` gave; returns what else there is."""
+    """Restores what `step_memory` gave; returns the entries of `memory` that are not of the step control."""
     arrays = {name: getattr(steps, name) for name in _CONTROL_MEMORY}
     arrays |= {f"achieved_{name}": getattr(steps.achieved, name) for name in _ACHIEVED_MEMORY}
     for name, array in arrays.items():

@@ -282,7 +282,7 @@ class ThermalStepper:
         )  # fmt: skip
 
     def _close(self, x: Any) -> None:
-        """Contact forces where the increment leads to, found with the full mobility, and what their change does."""
+        """Solves for contact forces at the pose that the full mobility leads to; adds the response to their change."""
         model, state, parts = self._system.model, self._system.state, self._parts
         self._renew_contacts(x)
         closing.set_difference(model, state, x, self._by_contacts, self._x)
@@ -296,8 +296,11 @@ class ThermalStepper:
         closing.add(self._system.model, self._in_contact.strong, self._change, x)
 
     def _solve_motors(self, x: Any) -> None:
-        """Puts motors on their laws. The full mobility shifts their rates a little, so it is done before and after it
-        is solved with: what is left errs by the square of that share."""
+        """Puts motors on their laws.
+
+        This is done before and after the solution with the full mobility, which shifts their rates a little: the error
+        left is of second order in that shift.
+        """
         model, state, parts, none = self._system.model, self._system.state, self._parts, self._none
         motor_solve.solve(
             model, state, self._data, parts.band, parts.law.gain, self.motors, none, none, self._data.one, x

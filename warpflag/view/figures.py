@@ -53,7 +53,7 @@ COLORS = [FLAGELLUM_COLORS[k] for k in (1, 0, *range(2, len(FLAGELLUM_COLORS)))]
 _LINE_STYLES = ("-", "--", ":", "-.")
 _BUNDLING = ("phase_difference", "bundle_length", "steric_force_density")
 _SWIMMING = ("body_speed", "body_rate")
-_FEW = 4  # lines of a panel that can be told apart; of more, mean and range are drawn
+_MOST_LINES = 4  # lines of a panel that can be told apart; of more, mean and range are drawn
 _SHARE_IN_VIEW = 0.99  # of the values of a panel are shown at least: peaks of single frames may be left out
 # A panel shows all values where they reach no further than this times what that share needs, which then fills at least
 # 1/1.6, five eighths, of its height.
@@ -121,7 +121,7 @@ def dashboard(run: Run | str | Path) -> Figure:
             _draw_forms(panels[-1], run)
         for axes, curve in zip(panels[: len(run.curves)], run.curves.values(), strict=True):
             many = curve.values.shape[1] > 1
-            if curve.values.shape[1] > _FEW:
+            if curve.values.shape[1] > _MOST_LINES:
                 low, high = curve.values.min(axis=1), curve.values.max(axis=1)
                 axes.fill_between(run.times, low, high, color=COLORS[0], alpha=0.25, linewidth=0)
                 axes.plot(run.times, curve.values.mean(axis=1), color=COLORS[0])

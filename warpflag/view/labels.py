@@ -10,8 +10,8 @@ from warpflag.scene import Scene, dumps
 
 __all__ = ["Labels", "labels_of"]
 
-_LEAST = ("name", "duration", "frames")  # they label runs only where nothing else differs
-_LONGEST = 48  # letters of a label
+_WEAK_KEYS = ("name", "duration", "frames")  # they label runs only where nothing else differs
+_LONGEST_LABEL = 48  # letters of a label
 
 
 class Labels(NamedTuple):
@@ -33,7 +33,7 @@ def labels_of(scenes: Sequence[Scene]) -> Labels:
     settings = [_flattened(tomllib.loads(dumps(scene))) for scene in scenes]
     keys = list(dict.fromkeys(key for each in settings for key in each))
     differing = [key for key in keys if len({str(each.get(key)) for each in settings}) > 1]
-    telling = [key for key in differing if key not in _LEAST] or [key for key in differing if key != "name"]
+    telling = [key for key in differing if key not in _WEAK_KEYS] or [key for key in differing if key != "name"]
     if len(telling) == 1:
         (key,) = telling
         values = [each.get(key) for each in settings]
@@ -41,7 +41,7 @@ def labels_of(scenes: Sequence[Scene]) -> Labels:
         title = " ".join(filter(None, [key, _unit(scenes[0], key)]))
         return Labels(title, [_text(value) for value in values], numbers if len(numbers) == len(values) else None)
     labels = [", ".join(f"{key.rpartition('.')[2]} {_text(each.get(key))}" for key in telling) for each in settings]
-    if not telling or max(map(len, labels)) > _LONGEST:
+    if not telling or max(map(len, labels)) > _LONGEST_LABEL:
         labels = [scene.name for scene in scenes]
     numbered = enumerate(labels, 1)
     return Labels("", [f"{label} ({k})" if labels.count(label) > 1 else label for k, label in numbered], None)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 _SCREEN_TOP, _SCREEN_BOTTOM = "#fafbfc", "#dde5ee"
 _SCREEN_GAP = 0.6  # um, from the farthest thing to the screen: shadows lie near what casts them
-_LOADED: set[str] = set()  # devices for which this process has loaded the ray caster
+_LOADED_DEVICES: set[str] = set()  # devices for which this process has loaded the ray caster
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # rad; turned by it, points of a spiral lie most evenly
 
 
@@ -67,9 +67,9 @@ def draw(
     view.vignette, view.shade = 0.12, 0.3
 
     picture: Any = wp.array(np.empty(3 * size[0] * size[1], np.uint8), dtype=wp.uint8, device=device)
-    if str(device) not in _LOADED:
+    if str(device) not in _LOADED_DEVICES:
         load_kernels(lambda: raycast.cast(capsules, view, picture), picture.device)
-        _LOADED.add(str(device))
+        _LOADED_DEVICES.add(str(device))
     raycast.cast(capsules, view, picture)
     return picture.numpy().reshape(size[1], size[0], 3)
 

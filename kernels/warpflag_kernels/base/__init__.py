@@ -1,1 +1,1 @@
-"""Precision, device arrays and clocks: what every kernel stands on."""
+"""Precision, the plan of execution, shared device arrays, clocks, random numbers."""

@@ -11,21 +11,21 @@ from typing import Any
 import warp as wp
 
 NO_FAULT = 2**31 - 1
-# Share of a step: what is closer to the target than this counts as reaching it, far above the round-off of a sum of
-# steps and far below what any observable resolves.
+# Fraction of a step: a time closer to the target than this counts as the target. Far above the round-off of a sum of
+# steps, far below what any observable resolves.
 STEP_TOLERANCE = 1.0e-6
 
 
 @wp.struct
 class Control:
-    """Per cell [C] unless said otherwise."""
+    """Clock of every cell and the state of the captured loop; per cell [C] unless said otherwise."""
 
     time: wp.array(dtype=wp.float64)  # [s]
-    target: wp.array(dtype=wp.float64)  # where this advance ends [s]
+    target: wp.array(dtype=wp.float64)  # time at which this advance ends [s]
     longest_step: wp.array(dtype=wp.float64)  # [s]
     step: wp.array(dtype=wp.float64)  # the current one [s]
     steps: wp.array(dtype=wp.int32)  # taken so far
-    rest: wp.array(dtype=wp.int32)  # 1: at the end of this step the cell rests until the next advance
+    rest: wp.array(dtype=wp.int32)  # 1: the cell stops at the end of this step until the next advance
     fault: wp.array(dtype=wp.int32)  # kind and element of the first violated guard, NO_FAULT while sound
     unfinished: wp.array(dtype=wp.int32)  # [1], cells short of their target
     between_steps: wp.array(dtype=wp.int32)  # [1], 1: some cell is at a start or an end of a step in this pass

@@ -1,4 +1,4 @@
-"""C++ that kernels call: read from a file beside its Python module, with words put in for names.
+"""C++ that kernels call: read from a file beside its Python module, with some of its words replaced.
 
 Loops that a compiler should turn into vector code need to be told that arrays do not overlap, which Warp's own
 language can't say. Such loops are C++, in files of their own that any editor colours.
@@ -25,7 +25,7 @@ def native(module_file: str, name: str, p: Precision, **words: object) -> str:
         module_file: `__file__` of the module.
         name: of the file, without its ending.
         p: precision; REAL in the file becomes its C++ type.
-        words: what stands for which word of the file; only whole words are replaced.
+        words: by word of the file, what replaces it; only whole words are replaced.
 
     Raises:
         ValueError: the file does not have one of the words.

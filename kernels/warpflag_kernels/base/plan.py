@@ -13,9 +13,9 @@ from warpflag_kernels.base.precision import Precision
 
 WARP = 32  # threads of a warp
 CONTACT_BLOCK = 128  # threads that solve the contacts of one cell on a GPU: an SM's four warp schedulers, one warp each
-GATHERING_BLOCK = 256  # threads of a block that gathers pairs on a GPU: what Warp takes where nothing is said
+GATHERING_BLOCK = 256  # threads of a block that gathers pairs on a GPU: Warp's default
 # Nodes of a cell up to which the coefficients of its pairs are stored during a step: N^2/2 pairs of four float32 are
-# 2 MB then, what a core's second-level cache holds; beyond, reading them takes as long as finding them again.
+# 2 MB then, what a core's second-level cache holds; beyond, reading them takes as long as computing them.
 STORED_NODES = 512
 
 
@@ -104,7 +104,7 @@ class Plan:
         contact_block: threads that solve the contacts of one cell.
 
     Raises:
-        ValueError: a choice is not known, or does not go with another one.
+        ValueError: a choice is unknown, or two of them exclude each other.
     """
 
     device: Any
@@ -147,11 +147,11 @@ class Plan:
 
     @property
     def gathering_block(self) -> int:
-        """Threads of a block that gathers pairs; on a CPU those of a warp, fibers that meet."""
+        """Threads of a block that gathers pairs; on a CPU one warp, run as fibers that wait for each other."""
         return WARP if self.gathering_threads > 1 and self.device.is_cpu else GATHERING_BLOCK
 
     def summary(self) -> str:
-        """The choices in a line, for people."""
+        """The choices in one line, as `warpflag check` prints it."""
         build = "strict build" if self.precision.strict else "fast build"
         pairs = "" if self.pair_precision == self.precision else f" with pairs in {self.pair_precision.name}"
         launch = "one launch per explicit right-hand side" if self.by_cells else "a launch per stage"

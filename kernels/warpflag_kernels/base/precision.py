@@ -28,22 +28,27 @@ class Precision:
 
     @property
     def real(self) -> Any:
+        """Warp's scalar type."""
         return {"float64": wp.float64, "float32": wp.float32}[self.name]
 
     @property
     def vec3(self) -> Any:
+        """Warp's vector of three."""
         return {"float64": wp.vec3d, "float32": wp.vec3f}[self.name]
 
     @property
     def vec4(self) -> Any:
+        """Warp's vector of four."""
         return {"float64": wp.vec4d, "float32": wp.vec4f}[self.name]
 
     @property
     def quat(self) -> Any:
+        """Warp's quaternion (x, y, z, w)."""
         return {"float64": wp.quatd, "float32": wp.quatf}[self.name]
 
     @property
     def mat33(self) -> Any:
+        """Warp's 3 x 3 matrix."""
         return {"float64": wp.mat33d, "float32": wp.mat33f}[self.name]
 
     @property
@@ -63,6 +68,7 @@ class Precision:
 
     @property
     def cpu_flags(self) -> str:
+        """Flags of the compiler for CPU kernels."""
         return STRICT_CPU_FLAGS if self.strict else FAST_CPU_FLAGS
 
     def module(self, stage: str, variant: str = "") -> Any:

@@ -1,4 +1,4 @@
-"""Random numbers by counter: Philox4x32 with ten rounds (Salmon et al., SC 11 (2011)), and normal deviates of them.
+"""Counter-based random numbers: Philox4x32 with ten rounds (Salmon et al., SC 11 (2011)), and normal deviates.
 
 A number depends on nothing but the seed of its cell, the element within the cell, the step and what it is for. So it is
 the same on every device, in every batch and after a resume, and there is no state to keep.
@@ -12,10 +12,11 @@ import warp as wp
 
 from warpflag_kernels.base.precision import Precision
 
-ROUNDS = 10
+PHILOX_ROUNDS = 10
 _MULTIPLIERS, _WEYL = (0xD2511F53, 0xCD9E8D57), (0x9E3779B9, 0xBB67AE85)  # of the paper above
 # What a number is for: fourth word of the counter.
-NODE, PAIRS, STRAIN, BODY_SHIFT, BODY_TURN, CONTACT, HOOK, PROBE, PROBE_SHIFT, PROBE_TURN = range(10)
+FOR_NODE, FOR_PAIRS, FOR_STRAIN, FOR_BODY_SHIFT, FOR_BODY_TURN = range(5)
+FOR_CONTACT, FOR_HOOK, FOR_PROBE, FOR_PROBE_SHIFT, FOR_PROBE_TURN = range(5, 10)
 
 
 @functools.cache
@@ -28,7 +29,7 @@ def counters() -> SimpleNamespace:
     @wp.func(module=module)
     def philox(c0: wp.uint32, c1: wp.uint32, c2: wp.uint32, c3: wp.uint32, k0: wp.uint32, k1: wp.uint32):
         """Four words of 32 random bits each, of a counter of four words and a key of two."""
-        for _round in range(wp.static(ROUNDS)):
+        for _round in range(wp.static(PHILOX_ROUNDS)):
             a = first * wp.uint64(c0)
             b = second * wp.uint64(c2)
             high_a = wp.uint32(a >> wp.uint64(32))

@@ -27,6 +27,8 @@ def struct() -> Any:
 
     @wp.struct
     class Groups:
+        """Flagella that are treated side by side in the lanes of a vector register; G groups."""
+
         first_group: wp.array(dtype=wp.int32)  # [C + 1]
         # Per group [G].
         first: wp.array(dtype=wp.int32)  # its first flagellum
@@ -67,8 +69,8 @@ def build(p: Precision, first_flagellum: np.ndarray, first_node: np.ndarray, dev
 def code(p: Precision, body: str) -> str:
     """C++ of a function with arguments `groups`, `g` and `first_node`, which does `body` for group g.
 
-    Loops over r, c, m (rows, columns and more of small blocks) and l (lanes) are unrolled: else the blocks that they
-    index would lie in memory.
+    Loops over r, c, m (rows, columns and right-hand sides of small blocks) and l (lanes) are unrolled, so that the
+    blocks that they index stay in registers.
 
     Args:
         p: precision of the lanes.

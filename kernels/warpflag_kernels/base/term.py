@@ -1,4 +1,4 @@
-"""A term of the forces: what it offers, and device functions that add up what several terms offer.
+"""A term of the forces: the device functions that it has, and the sums of those of several terms.
 
 Every right-hand side is built from one ordered list of terms (`stepping/terms.py`): launched stage by stage, a whole
 cell in one launch, without the contacts that an implicit step solves for, or linearised. The Rotne-Prager sum and the
@@ -52,10 +52,10 @@ class Term:
         stiffness: sets or adds to the second derivatives of the energy in the matrix of an implicit step,
             `stiffness(model, state, stiffness)`, in the order of the terms. None: it has none there.
         within_step: the term that stands for this one in an implicit step. None: itself.
-        timed: whether it depends on time itself, `State.time`.
+        timed: whether its forces depend explicitly on time, `State.time`.
         after_step: changes the term's own state once a step has been accepted and committed, a part of a pass:
-            `after_step(model, state, chart, control, counted)`, `counted` whether the clocks stand at its end already.
-            None: it has no such state.
+            `after_step(model, state, chart, control, counted)`; `counted` says whether the clocks have been advanced to
+            the end of the step. None: it has no such state.
         carried: arrays of that state, by their dotted names in `DeviceState.optional`; checkpoints hold them.
     """
 
@@ -78,8 +78,11 @@ def variant(terms: Sequence[Term]) -> str:
 
 @functools.cache
 def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
-    """Device functions of several terms together, in their order: those of `Term.functions`, each one function that
-    adds up all terms; but `in_cell` and `in_flagellum`, which stay lists, and `settle`, of one term or None."""
+    """The device functions of `Term.functions`, each summed over several terms in their order.
+
+    `in_cell` and `in_flagellum` are lists with one function per term that has it; `settle` is that of the one term that
+    has it, or None.
+    """
     real, vec3 = p.real, p.vec3
     Model, State = structs(p).Model, structs(p).State
     module = p.module("terms", variant(terms))

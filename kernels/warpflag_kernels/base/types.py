@@ -45,7 +45,7 @@ def structs(p: Precision) -> SimpleNamespace:
         """Per flagellum [K]; vectors in body axes."""
 
         torque: wp.array(dtype=real)  # T_m [pN um]
-        axis: wp.array(dtype=vec3)  # m
+        axis: wp.array(dtype=vec3)  # m, unit vector
         anchor: wp.array(dtype=vec3)  # r_0 [um]
 
     @wp.struct
@@ -56,7 +56,7 @@ def structs(p: Precision) -> SimpleNamespace:
         prescribed: wp.array(dtype=wp.int32)  # 1: the rate is prescribed, not the torque
         rate: wp.array(dtype=real)  # that rate, relative to the body [rad/s]
         first_switch: wp.array(dtype=wp.int32)  # [K + 1], flagellum k has the corners from first_switch[k] on
-        switch_time: wp.array(dtype=wp.float64)  # [corners] [s]
+        switch_time: wp.array(dtype=wp.float64)  # [corners], time of a corner [s]
         switch_drive: wp.array(dtype=real)  # [corners], drive there, from 1 (forward) to -1 (reverse)
 
     @wp.struct
@@ -78,14 +78,14 @@ def structs(p: Precision) -> SimpleNamespace:
 
         stiffness: wp.array(dtype=real)  # without a torque [pN um/rad]
         stiffening: wp.array(dtype=real)  # 1/T_s: how much it grows by the motor's torque [1/(pN um)]
-        helix_axis: wp.array(dtype=vec3)  # of the flagellum at rest, in the axes of segment 1
+        helix_axis: wp.array(dtype=vec3)  # unit vector, of the flagellum at rest, in the axes of segment 1
 
     @wp.struct
     class Drag:
         """Local mobility."""
 
         mobility_along: wp.array(dtype=real)  # [E], of a node along the tangent [um/(s pN)]
-        mobility_across: wp.array(dtype=real)  # [E] [um/(s pN)]
+        mobility_across: wp.array(dtype=real)  # [E], of a node across the tangent [um/(s pN)]
         spin_mobility: wp.array(dtype=real)  # [K], of a segment about its tangent [1/(pN um s)]
 
     @wp.struct
@@ -107,13 +107,13 @@ def structs(p: Precision) -> SimpleNamespace:
         """Per cell [C]: the capsule that contact sees, and the mobility of the spheroid or of its shell of beads."""
 
         half_length: wp.array(dtype=real)  # of the capsule's axis [um]
-        radius: wp.array(dtype=real)  # [um]
+        radius: wp.array(dtype=real)  # of the capsule [um]
         mobility_along: wp.array(dtype=real)  # along its axis [um/(s pN)]
-        mobility_across: wp.array(dtype=real)
+        mobility_across: wp.array(dtype=real)  # across its axis [um/(s pN)]
         spin_mobility: wp.array(dtype=real)  # about its axis [1/(pN um s)]
         tumble_mobility: wp.array(dtype=real)  # about an axis across it [1/(pN um s)]
-        # [36 C], of a shell of beads, from force and torque to velocity and spin in body axes, row after row; then
-        # without the four above.
+        # [36 C], of a shell of beads, from force and torque to velocity and spin in body axes, row after row;
+        # where it is set, the four above are empty.
         shell_mobility: wp.array(dtype=real)
 
     @wp.struct
@@ -125,18 +125,18 @@ def structs(p: Precision) -> SimpleNamespace:
 
     @wp.struct
     class Model:
-        cell_of: wp.array(dtype=wp.int32)  # [E]
-        flagellum_of: wp.array(dtype=wp.int32)  # [E]
-        first_node: wp.array(dtype=wp.int32)  # [K + 1]
-        first_flagellum: wp.array(dtype=wp.int32)  # [C + 1]
+        cell_of: wp.array(dtype=wp.int32)  # [E], of an element
+        flagellum_of: wp.array(dtype=wp.int32)  # [E], of an element
+        first_node: wp.array(dtype=wp.int32)  # [K + 1], flagellum k has the elements from first_node[k] on
+        first_flagellum: wp.array(dtype=wp.int32)  # [C + 1], cell c has the flagella from first_flagellum[c] on
         rod: Rod
         motor: Motor
         drag: Drag
         pairs: Pairs
         steric: Steric
         body: Body
-        # Terms that a scene may do without: each an array of one struct, empty without the term. A launch passes on
-        # every array among its arguments, 3 to 4 ns each on a CPU: so that is one for each of these.
+        # Optional terms: each an array of one struct, empty without the term. A launch passes on every array among its
+        # arguments, 3 to 4 ns each on a CPU, so each of these terms costs one.
         motor_law: wp.array(dtype=MotorLaw)
         hook: wp.array(dtype=Hook)
         polymorphs: wp.array(dtype=Polymorphs)
@@ -158,7 +158,7 @@ def structs(p: Precision) -> SimpleNamespace:
 
         torque: wp.array(dtype=real)  # at the moment evaluated [pN um]
         within_step: wp.array(dtype=real)  # in an implicit step [pN um]
-        slope: wp.array(dtype=real)  # of the piece of its curve that it was on last [pN um s]
+        slope: wp.array(dtype=real)  # of the piece of its curve on which it was found last [pN um s]
         on_hook: wp.array(dtype=real)  # at the end of the last step; only with a hook that stiffens by it [pN um]
 
     @wp.struct
@@ -195,8 +195,8 @@ def structs(p: Precision) -> SimpleNamespace:
         flagellum_torque: wp.array(dtype=vec3)  # [K], about the body centre [pN um]
         surface_force: wp.array(dtype=vec3)  # [C], of the flow on the body when it is held [pN]; only with body flow
         surface_torque: wp.array(dtype=vec3)  # [C], about its centre [pN um]
-        body_velocity: wp.array(dtype=vec3)  # [C] [um/s]
-        body_spin: wp.array(dtype=vec3)  # [C] [rad/s]
+        body_velocity: wp.array(dtype=vec3)  # [C], of the body's centre, lab [um/s]
+        body_spin: wp.array(dtype=vec3)  # [C], angular velocity, lab [rad/s]
 
     return SimpleNamespace(Model=Model, Pose=Pose, State=State)
 
@@ -207,11 +207,11 @@ class DeviceModel:
 
     Attributes:
         plan: how its kernels are executed.
-        switches: which of them there are.
+        switches: the terms that the scenes ask for.
         terms: force terms in their order, instances of `Term`.
         cell_count, flagellum_count, element_count: sizes C, K, E.
         data: the struct `Model`.
-        optional: structs of terms that a scene may do without, by their names in `Model`, as in `optional`.
+        optional: structs of the optional terms, by their names in `Model`, as in `optional`.
         groups: the struct `Groups`: flagella side by side in vector lanes.
         shells: beads of the bodies on the host, `warpflag_kernels.fluid.shell.Shells`; None without body flow.
     """
@@ -252,7 +252,7 @@ class DeviceState:
 
     Attributes:
         data: the struct `State`.
-        optional: structs of terms that a scene may do without, by their names in `State`, as in `optional`.
+        optional: structs of the optional terms, by their names in `State`, as in `optional`.
         pairs: the struct `PairSum` of the Rotne-Prager sum.
         shell: the struct `Shell` of the flow round the body.
         neighbours: the struct `Neighbours` of the steric force.
@@ -276,23 +276,24 @@ def allocate_pose(p: Precision, cell_count: int, element_count: int, device: Any
 
 
 def optional(whole: Any) -> SimpleNamespace:
-    """Structs of the terms that a scene may do without, by their names in the struct `Model` or `State`, no array set.
+    """Structs of the optional terms, by their names in the struct `Model` or `State`; none of their arrays is set.
 
-    A kernel reads them by way of arrays of one struct, which the host cannot look into: it keeps them beside the whole.
+    Kernels read each through an array of one struct, whose contents the host cannot read; so the host keeps the
+    structs, too.
     """
     kinds = {name: var.type.dtype for name, var in whole.vars.items() if isinstance(var.type, wp.array)}
     return SimpleNamespace(**{name: kind() for name, kind in kinds.items() if hasattr(kind, "vars")})
 
 
 def attach(parts: SimpleNamespace, data: Any, device: Any) -> None:
-    """Puts the structs of `optional` that have arrays where kernels find them, in arrays of one in `data`."""
+    """Puts those structs of `optional` that have arrays into `data`, each in an array of one, where kernels find it."""
     for name, part in vars(parts).items():
         if any(getattr(part, field) is not None for field in part._cls.vars):
             setattr(data, name, wp.array([part], dtype=part._cls, device=device))
 
 
 def allocate_state(model: DeviceModel) -> tuple[Any, SimpleNamespace]:
-    """Arrays of the struct `State`, zero, and its optional parts; a term that is off gets none."""
+    """The struct `State`, its arrays zero, and its optional structs; a term that is off gets no arrays."""
     p, device = model.precision, model.device
     cells, flagella, elements = model.cell_count, model.flagellum_count, model.element_count
 

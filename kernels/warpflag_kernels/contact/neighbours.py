@@ -19,12 +19,12 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact.constants import OWN_SPACING
 
-CONTACT_REACH = (
-    1.5  # reach of the lists without the skin [sigma]: the cutoff 1.122 plus the search's margin, rounded up
-)
+# Reach of the lists without the skin [sigma]: the cutoff 1.122 plus the margin of the search, rounded up.
+CONTACT_REACH = 1.5
 SKIN = 0.1  # [um]; at 6 mm/s, the fastest tips, a list serves 8 us
 SLOTS = 64  # room of a list, and bits of the mask in which a search marks its contacts
-SLACK = 1.1  # a segment is at most this times the longest one at the last check: twice the strain that guards allow
+# Bound on the length of a segment over that of the longest one at the last check: 1 plus twice the allowed strain.
+SLACK = 1.1
 TESTED_AT_ONCE = 16  # segments that a CPU tests at once: one vector of float32
 
 
@@ -128,7 +128,7 @@ def functions(p: Precision, with_self: bool) -> SimpleNamespace:
         """The next segment after j that can be near: neighbouring midpoints are at most a segment's length apart.
 
         Args:
-            longest: length of its longest segment [um].
+            longest: length of the longest segment of the flagellum of j [um].
             distance: of the midpoint of segment j [um].
             reach: how near a segment must come, its own half length not counted [um].
         """

@@ -1,6 +1,6 @@
 """Contact forces: segment against segment of other flagella or of its own, node against the body surface.
 
-Every pair of segments within the cutoff acts, so a contact near a vertex counts up to four times. A force at
+Every pair of segments within the cutoff acts, so a contact near a node counts up to four times. A force at
 parameter t of a segment acts by (1 - t) on its first and t on its second node: force and torque are conserved
 exactly. Each segment sums its own pairs; both sides evaluate a pair in the same order, hence to the same bits. One
 thread that does a whole cell takes every pair once for both sides instead, for the same sums in the same order.

@@ -161,11 +161,11 @@ def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]
 
 
 def obstruct(model: DeviceModel, state: DeviceState, single: Any = None) -> None:
-    """What the flow of the nodes does to bodies that are held, into `surface_force` and `surface_torque`.
+    """Force and torque of the nodes' flow on every body, held at rest, into `surface_force` and `surface_torque`.
 
     Args:
         model, state: of the batch.
-        single: the struct `Shell` in single precision, with nodes in their places, instead of the state's.
+        single: struct `Shell` in single precision that already has the nodes' positions, in place of the state's.
     """
     if single is not None:
         body_flow.obstruct(model, state, single, model.precision.single, placed=True)
@@ -194,7 +194,7 @@ def body_motion(
     Args:
         model, state: of the batch.
         terms: those that count; default: all of the model.
-        single: the struct `Shell` in single precision, with nodes in their places, instead of the state's.
+        single: struct `Shell` in single precision that already has the nodes' positions, in place of the state's.
     """
     terms = model.terms if terms is None else terms
     sum_flagella(model, state, terms)

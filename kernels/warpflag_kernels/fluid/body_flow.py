@@ -1,7 +1,7 @@
 """Kernels of the flow round the body, whose equations are in `shell_flow`.
 
 A CPU takes a cell in one thread, in vectors of beads, and stores the coefficients of all tensors C, since they are
-used several times. A GPU has a thread for every bead and for every node, which find them again.
+used several times. A GPU has a thread for every bead and for every node, each of which computes them anew.
 """
 
 import functools
@@ -144,10 +144,13 @@ def _kernels(p: Precision, pair: Precision) -> SimpleNamespace:
 
 
 def obstruct(model: DeviceModel, state: DeviceState, shell: Any, pair: Precision, placed: bool = False) -> None:
-    """Loads on the bodies, held, and their resultants, from positions and forces of the nodes.
+    """Held loads of the bodies and their resultants, from positions and forces of the nodes.
 
-    shell: the struct `Shell`; pair: its precision; placed: whether it already has the positions of the nodes, and
-    coefficients where they are stored.
+    Args:
+        model, state: of the batch; the resultants go into `surface_force` [pN] and `surface_torque` [pN um].
+        shell: struct `Shell`.
+        pair: its precision.
+        placed: whether it already has the nodes' positions, and the coefficients where they are stored.
     """
     data, cells, device = model.data, model.cell_count, model.device
     if model.plan.by_cells:
@@ -162,7 +165,13 @@ def obstruct(model: DeviceModel, state: DeviceState, shell: Any, pair: Precision
 
 
 def carry(model: DeviceModel, state: DeviceState, shell: Any, pair: Precision) -> None:
-    """Adds what the loads on the moving bodies do to the velocities of nodes; after `obstruct` and their motion."""
+    """Adds to the nodes' velocities the flow that the loads on the moving bodies cause [um/s].
+
+    Args:
+        model, state: of the batch; the motion of the bodies has been found.
+        shell: struct `Shell`, with the held loads of `obstruct`.
+        pair: its precision.
+    """
     data, cells, device = model.data, model.cell_count, model.device
     if model.plan.by_cells:
         kernel = _cell_kernels(model.precision, pair, False).carry_cells

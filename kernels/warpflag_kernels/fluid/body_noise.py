@@ -15,8 +15,8 @@ by a random finite difference (Delong, Usabiaga, Delgado-Buscalioni, Griffith & 
 
     kT div M = < kT/d [M(q + d W/2) - M(q - d W/2)] W >,
 
-M without what has no divergence of that kind, S and R. Its scatter is bounded as steps become short, where thermal
-velocities grow as the inverse root of the step, so it adds nothing to them in the limit.
+M without S, whose divergence has a closed form (`noise`), and R, which has none. Its scatter stays bounded as steps
+become short, while thermal velocities grow as the inverse root of the step: in the limit it adds nothing to them.
 """
 
 import functools
@@ -47,7 +47,8 @@ def _kernels(p: Precision, pair: Precision) -> SimpleNamespace:
     normals = random_numbers.functions(p).normals
     rotation_vector_quat = rotations.functions(p.double).rotation_vector_quat
     for_node, for_shift, for_turn = (
-        wp.constant(x) for x in (random_numbers.PROBE, random_numbers.PROBE_SHIFT, random_numbers.PROBE_TURN)
+        wp.constant(x)
+        for x in (random_numbers.FOR_PROBE, random_numbers.FOR_PROBE_SHIFT, random_numbers.FOR_PROBE_TURN)
     )
     displacement = wp.constant(wp.float64(DISPLACEMENT))
     zero = wp.constant(real(0.0))
@@ -113,7 +114,7 @@ def _kernels(p: Precision, pair: Precision) -> SimpleNamespace:
         # Out:
         noise: Noise,
     ):
-        """Deviates W."""
+        """Draws the deviates W."""
         e = wp.tid()
         c = model.cell_of[e]
         if active[c] == 0:
@@ -138,7 +139,7 @@ def _kernels(p: Precision, pair: Precision) -> SimpleNamespace:
         # Out:
         state: State,
     ):
-        """Nodes and bodies at q + sign d W/2, under the forces W."""
+        """Puts nodes and bodies at q + sign d W/2, under the forces W."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
@@ -198,12 +199,12 @@ def hold_bodies(model: DeviceModel, state: DeviceState) -> None:
 
 
 def carry(model: DeviceModel, state: DeviceState, noise: Any, shell: Any, pair: Precision) -> None:
-    """Adds to the thermal velocities of nodes what the random motion of the bodies, in `noise.body`, does to them.
+    """Adds to the thermal velocities of nodes the flow that the random motion of the bodies, `noise.body`, causes.
 
     Args:
         model, state: of the batch; velocities of `state` are overwritten.
         noise: struct `Noise`.
-        shell: struct `Shell`, which has the nodes in their places.
+        shell: struct `Shell`, which has the nodes' positions.
         pair: its precision.
     """
     kernels, device, elements = _kernels(model.precision, pair), model.device, model.element_count
@@ -213,7 +214,7 @@ def carry(model: DeviceModel, state: DeviceState, noise: Any, shell: Any, pair: 
 
 
 def draw_probe(model: DeviceModel, state: DeviceState, noise: Any, steps: Any) -> None:
-    """The deviates W of a step."""
+    """Draws the deviates W of a step; steps: its number in every cell, shape [cell_count]."""
     kernel = _kernels(model.precision, model.plan.pair_precision).probe
     inputs = [model.data, state.data.active, steps, noise]
     wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)

@@ -76,7 +76,7 @@ def _kernels(p: Precision, free: bool) -> SimpleNamespace:
     normals, root = random_numbers.functions(p).normals, root_function(p)
     self_mobility = noise_stage.functions(p, True).self_mobility
     drag_velocity = node_velocity.local(p).drag_velocity
-    most, fixed, for_pairs = wp.constant(MOST_PRODUCTS), wp.constant(PRODUCTS), wp.constant(random_numbers.PAIRS)
+    most, fixed, for_pairs = wp.constant(MOST_PRODUCTS), wp.constant(PRODUCTS), wp.constant(random_numbers.FOR_PAIRS)
     exhausted = wp.constant(wp.float64(EXHAUSTED))
     vec6 = wp.types.vector(6, real)
     module = p.module("lanczos", "free" if free else "")
@@ -262,7 +262,7 @@ def draw_pairs(
     Args:
         model, state: of the batch.
         control: struct `Control`, with the step that begins and its number.
-        noise: struct `Noise`, with its local part.
+        noise: struct `Noise`, with the local part of this step's velocities.
         process: room to work in.
         velocities: finds node velocities from forces.
     """

@@ -1,7 +1,7 @@
 """Node velocities: local anisotropic drag plus the Rotne-Prager pair sum, plus the flow of the body's surface.
 
-Local (the paper's mu_t): [t t/gamma_par + (I - t t)/gamma_perp]/h per node (h/2 at the free end), t the normalised
-sum of the adjacent tangents, at the last node the last segment's.
+Local drag (mu_t of the paper's equation 1): [t t/gamma_par + (I - t t)/gamma_perp]/h per node (h/2 at the free end), t
+the normalised sum of the adjacent tangents, at the last node the last segment's.
 """
 
 import functools
@@ -53,7 +53,7 @@ def functions(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> Sim
             return
         v = drag_velocity(model, state, e, k)
         if wp.static(flows.pairs == "free") and e == model.first_node[k]:
-            v = state.body_velocity[c]  # a free end, by its local mobility so far
+            v = state.body_velocity[c]  # a free end: what its local mobility gives
         if wp.static(flows.pairs != "none"):
             v += model.pairs.mobility[c] * flow_at(model, s, e, k, c, thread)
         if thread == 0:
@@ -142,8 +142,11 @@ def _variant(p: Precision, pair: Precision, flows: Flows, pair_sum: str) -> str:
 
 
 def node_velocities(model: DeviceModel, state: DeviceState) -> None:
-    """Velocity of every node in the lab [um/s], into `velocity`; needs the forces and the body's motion, and with flow
-    round the body its held loads."""
+    """Velocity of every node in the lab [um/s], into `velocity`.
+
+    Args:
+        model, state: of the batch, with the forces, the bodies' motion and, with flow round the body, the held loads.
+    """
     plan, device = model.plan, model.device
     flows = model.switches.flows
     kernels = _kernels(model.precision, plan.pair_precision, flows, plan.pair_sum)

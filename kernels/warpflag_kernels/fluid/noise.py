@@ -1,4 +1,4 @@
-"""Thermal velocities of a step: random ones whose covariance is that of the mobility, and the mean drift.
+"""Thermal velocities of a step: random ones with the covariance of the mobility, and the mean drift.
 
 By the fluctuation-dissipation theorem a step of length dt adds the velocity (2 kT/dt)^1/2 M^1/2 xi, xi normal deviates.
 M = S + R is drawn in two independent parts. R is the Rotne-Prager sum with its self term (`lanczos`). S is what the
@@ -45,7 +45,7 @@ def struct(p: Precision) -> Any:
         # Only with flow round the body.
         body_root: wp.array(dtype=real)  # [36 C], root of the shell's mobility in body axes, row after row
         body_inverse: wp.array(dtype=real)  # [36 C], its inverse; zero in directions without a mobility
-        carried: wp.array(dtype=vec3)  # [E], what the random motion of the body does to nodes [um/s]
+        carried: wp.array(dtype=vec3)  # [E], flow at nodes that the random motion of the body causes [um/s]
         probe: wp.array(dtype=vec3)  # [E], deviates W of nodes, by which the divergence is found
         probe_shift: wp.array(dtype=vec3)  # [C], of the body's motion
         probe_turn: wp.array(dtype=vec3)  # [C]
@@ -172,7 +172,7 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool, drifting: bool)
     shell_product = f.shell_product
     zero, two = wp.constant(real(0.0)), wp.constant(real(2.0))
     for_node, for_shift, for_turn = (
-        wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
+        wp.constant(x) for x in (random_numbers.FOR_NODE, random_numbers.FOR_BODY_SHIFT, random_numbers.FOR_BODY_TURN)
     )
     names = "pairs" * pairs + "free" * free + "_shell" * shell + "_drifting" * drifting
     module = p.module("noise", names)
@@ -256,7 +256,7 @@ def draw_local(model: DeviceModel, state: DeviceState, control: Any, noise: Any,
         model, state: of the batch.
         control: struct `Control`, with the step that begins and its number.
         noise: struct `Noise`.
-        drifting: whether with the drift, that of steps which resolve all modes.
+        drifting: whether to add the drift kT div M, which is right for steps that resolve all modes.
     """
     switches = model.switches
     pairs, free = switches.pairs != "none", switches.has("free end")

@@ -77,7 +77,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 def tensor_code(p: Precision, unequal: bool, sums: str) -> str:
-    """C++ that defines tensor(r2, j, c, d) of node i; equal and unequal radii have a file each.
+    """C++ that defines tensor(r2, j, c, d): c I + d dd^T, dd the vector between nodes i and j, r2 its square.
 
     Args:
         p: precision of the pairs.
@@ -91,8 +91,13 @@ def tensor_code(p: Precision, unequal: bool, sums: str) -> str:
 
 @functools.cache
 def rows(p: Precision, unequal: bool, threads: int = 1) -> SimpleNamespace:
-    """Device functions of one row of pairs: `add_row` counts them at both nodes, `gather_pairs` at one, where so many
-    threads take turns."""
+    """Device functions of one row of pairs: `add_row` adds their flows at both nodes, `gather_pairs` at node i alone.
+
+    Args:
+        p: precision of the pairs.
+        unequal: whether nodes have unequal pair radii.
+        threads: that share the row in `gather_pairs`, each taking every so-many-th pair.
+    """
     real, vec3, PairSum, tensor = p.real, p.vec3, struct(p), tensor_code(p, unequal, "s")
 
     @wp.func_native(native(__file__, "symmetric_row", p, TENSOR=tensor))

@@ -39,7 +39,7 @@ class Shells:
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `Shell`: beads of the bodies, and nodes as they are seen from there."""
+    """The struct `Shell`: beads of the bodies, and nodes in body axes."""
     real, vec3 = p.real, p.vec3
 
     @wp.struct
@@ -54,7 +54,7 @@ def struct(p: Precision) -> Any:
         z: wp.array(dtype=real)
         inverse: wp.array(dtype=real)  # M_c^-1 over 8 pi eta [um]; component after component, as loads and flows
         rigid: wp.array(dtype=real)  # its product with K, column after column [um, um^2]
-        # Coefficients of node and bead, flow = c f + d (dd . f); only where they are stored.
+        # Coefficients of node and bead, flow = c f + d dd (dd . f), dd the vector between them; only where stored.
         pair: wp.array(dtype=wp.int32)  # [C], where those of a cell begin, node after node
         c: wp.array(dtype=real)  # [1/um]
         d: wp.array(dtype=real)  # [1/um^3]

@@ -34,7 +34,7 @@ def functions(p: Precision, pair: Precision, stored: bool, placed: bool = False)
         p: precision of the run.
         pair: precision of the beads' flows.
         stored: whether the coefficients of nodes and beads are stored.
-        placed: whether `obstruct` finds nodes in their places, and coefficients stored.
+        placed: whether `obstruct` finds the nodes' positions and the coefficients in the struct already.
     """
     real, vec3, mat33, Shell = pair.real, pair.vec3, p.mat33, shell_stage.struct(pair)
     Model, State = structs(p).Model, structs(p).State

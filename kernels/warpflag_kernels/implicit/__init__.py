@@ -1,1 +1,1 @@
-"""Implicit stepping: collocation, its linear system, contact forces of a step."""
+"""Implicit stepping: collocation, its linear system, stability, contact forces and motor torques of a step."""

@@ -13,7 +13,7 @@ from warpflag_kernels.base import simd
 from warpflag_kernels.base.native import native
 from warpflag_kernels.base.precision import Precision
 
-NUMBERS = 42  # of a factorised row
+NUMBERS_PER_ROW = 42  # of a factorised row
 
 
 @functools.cache
@@ -23,7 +23,7 @@ def struct(p: Precision) -> Any:
 
     @wp.struct
     class Factors:
-        blocks: wp.array(dtype=real)  # NUMBERS per row
+        blocks: wp.array(dtype=real)  # NUMBERS_PER_ROW per row
         solution: wp.array(dtype=real)  # 4 per row; work space
 
     return Factors
@@ -32,7 +32,7 @@ def struct(p: Precision) -> Any:
 def build(p: Precision, groups: Any) -> Any:
     """Room for the factors of these groups."""
     factors, size = struct(p)(), int(groups.start.numpy()[-1])
-    for name, numbers in (("blocks", NUMBERS), ("solution", 4)):
+    for name, numbers in (("blocks", NUMBERS_PER_ROW), ("solution", 4)):
         setattr(factors, name, wp.zeros(numbers * size, dtype=p.real, device=groups.start.device))
     return factors
 
@@ -47,7 +47,7 @@ def functions(p: Precision) -> SimpleNamespace:
     def in_file(name: str, **words: object) -> str:
         return native(__file__, name, p, **words)
 
-    places = in_file("factor_places", NUMBERS=NUMBERS)
+    places = in_file("factor_places", NUMBERS=NUMBERS_PER_ROW)
     nodes = {
         "LOAD": in_file("load_nodes"),
         "FILLED": "rows",
@@ -63,7 +63,7 @@ def functions(p: Precision) -> SimpleNamespace:
         "MANY": 3,
     }
 
-    @wp.func_native(simd.code(p, in_file("factorise_group", PLACES=places, NUMBERS=NUMBERS)))
+    @wp.func_native(simd.code(p, in_file("factorise_group", PLACES=places, NUMBERS=NUMBERS_PER_ROW)))
     def factorise(
         groups: Groups,
         factors: Factors,
@@ -76,12 +76,12 @@ def functions(p: Precision) -> SimpleNamespace:
         cell: wp.int32,
     ): ...
 
-    @wp.func_native(simd.code(p, in_file("solve_group", PLACES=places, NUMBERS=NUMBERS, **nodes)))
+    @wp.func_native(simd.code(p, in_file("solve_group", PLACES=places, NUMBERS=NUMBERS_PER_ROW, **nodes)))
     def solve(
         groups: Groups, factors: Factors, g: wp.int32, first_node: wp.array(dtype=wp.int32), x: wp.array(dtype=vec4)
     ): ...
 
-    @wp.func_native(simd.code(p, in_file("solve_group", PLACES=places, NUMBERS=NUMBERS, **body)))
+    @wp.func_native(simd.code(p, in_file("solve_group", PLACES=places, NUMBERS=NUMBERS_PER_ROW, **body)))
     def columns(
         groups: Groups,
         factors: Factors,

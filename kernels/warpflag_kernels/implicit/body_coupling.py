@@ -3,7 +3,7 @@
 r_0 and the motor axis of every flagellum move with the body, so its six unknowns (u, w) couple to the first three
 elements of every flagellum. With W the band's solution for these six columns and M_b the body's mobility,
 
-    S = 1 + dt s M_b (H_bb - H_bf W),    W = K^-1 s H_fb
+    S = 1 + dt s M_b (H_bb - H_bf W),    W = K^-1 s H_fb.
 """
 
 import functools
@@ -21,15 +21,19 @@ from warpflag_kernels.rod import chain_chart, hessian
 
 @functools.cache
 def functions(p: Precision, shell: bool) -> SimpleNamespace:
-    """Device functions: the mobility of a body, a shell of beads or a spheroid, on six numbers, and the inverse of a
-    matrix."""
+    """Device functions: `body_rate`, the motion of a body under a load, and `inverse6`, the inverse of a matrix.
+
+    Args:
+        p: precision.
+        shell: whether bodies are shells of beads; else spheroids.
+    """
     real, vec3, vec6, mat66 = p.real, p.vec3, block_band.types(p).vec6, block_band.types(p).mat66
     Model, State, respond = structs(p).Model, structs(p).State, body.mobility(p, shell).respond
     module = p.module("body_coupling_functions", "shell" * shell)
 
     @wp.func(module=module)
     def body_rate(model: Model, state: State, c: wp.int32, load: vec6):
-        """Velocity and angular velocity of a body under force and torque."""
+        """Velocity [um/s] and angular velocity [rad/s] of a body under force [pN] and torque [pN um]."""
         u, w = respond(model, state, c, vec3(load[0], load[1], load[2]), vec3(load[3], load[4], load[5]))
         return vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 

@@ -8,9 +8,9 @@ theta w delta + e, so
 
 and the whole step is w delta + e/rho. The error is proportional to 3 theta^2 - 1, and stiff modes are damped for any
 theta above 2^-1/2, but alternate in sign for some steps below 1. So the last step of an advance takes theta = 1, which
-is BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside do not. Both
-iterations evaluate V once, at the pose known so far, and solve for what is missing; the first one begins with a share
-of the e that the last three states predict:
+is BDF2: forces and energies at its end are those of an equilibrated state. Steps with frames inside keep `THETA`. Each
+iteration evaluates V once, at the pose known so far, and solves for what is missing of e; the first one begins with a
+share of the e that the last three states predict:
 
     (1/dt + g M H) z = g [V - w delta/dt] - e/dt + g M B (F - F_x)
 
@@ -45,12 +45,12 @@ from warpflag_kernels.stepping.step_control import StepControl
 # 0.8 and 0.84 at 0.75 (docs/numerics.md).
 THETA = 0.8
 # Error estimate over the mean predictor error of the nodes of a flagellum, that with the largest mean, for theta = 1;
-# measured. The mean is controlled, since contacts that open, close or pass a vertex make single nodes jump, which does
+# measured. The mean is controlled, since contacts that open, close or pass a node make single nodes jump, which does
 # not add up over time.
 ERROR_PER_PREDICTOR = 3.5
 # Over-implicitness up to which a step begins with the whole prediction, equal to the least that a step has,
-# `stability.LEAST`. With more, two iterations leave so much of a prediction in stiff modes that an extrapolation
-# through three states would ring (docs/numerics.md).
+# `stability.LEAST_OVER_IMPLICIT`. With more, two iterations leave so much of a prediction in stiff modes that an
+# extrapolation through three states would ring (docs/numerics.md).
 BEGUN_WHOLE = 1.3
 GAP_SHARE = 0.1  # residual of the gaps that the contact solve may leave, over the error that a step may make
 # A residual of this times dt^3 is always allowed [um/s^3]: the truncation error of a step grows as dt^3, too.
@@ -106,7 +106,7 @@ def allocate(model: DeviceModel) -> Any:
 
 @functools.cache
 def kernels(p: Precision) -> SimpleNamespace:
-    """The kernels."""
+    """Kernels of the collocation of one step: `begin`, `right_hand_side`, `complete`, `decide`, and what is kept."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Implicit = chart_stage.struct(p), struct(p)

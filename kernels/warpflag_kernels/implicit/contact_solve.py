@@ -32,7 +32,7 @@ from warpflag_kernels.implicit.delassus import meet, struct
 from warpflag_kernels.rod import chain_chart
 
 NEWTON_STEPS = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
-ITERATIONS = 60  # at most; crowds take some ten
+CONTACT_ITERATIONS = 60  # products with W at most; crowds take some ten
 FINEST = 1.0e-6  # least tolerance of a gap [sigma]; below, the residual is round-off of the float32 flows
 # Diagonal compliance over that of the nodes' local drag alone: elasticity and neighbours hold a node as well.
 DIAGONAL_PER_DRAG = 0.25
@@ -51,17 +51,17 @@ def _loops(p: Precision, threads: int) -> SimpleNamespace:
     law, bits = steric.law_code(p), {"float64": "long long", "float32": "int"}[p.name]
 
     @wp.func_native(native(__file__, "load_contacts", p, LAW=law, THREADS=threads))
-    def load_all(
+    def load_contacts(
         law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32
     ) -> real: ...
 
     @wp.func_native(native(__file__, "add_product", p, THREADS=threads))
-    def take(
+    def add_product(
         law_in: Law, x: Increment, begin: wp.int32, stop: wp.int32, first: wp.int32, end: wp.int32, thread: wp.int32
     ): ...
 
     @wp.func_native(native(__file__, "residuals", p, THREADS=threads, BITS=bits))
-    def leave(law_in: Law, begin: wp.int32, stop: wp.int32, thread: wp.int32) -> real: ...
+    def residuals(law_in: Law, begin: wp.int32, stop: wp.int32, thread: wp.int32) -> real: ...
 
     words = {"NEWTON_STEPS": NEWTON_STEPS, "CUTOFF": CUTOFF, "LINEAR": LINEAR_BELOW}
 
@@ -70,7 +70,9 @@ def _loops(p: Precision, threads: int) -> SimpleNamespace:
         law_in: Law, begin: wp.int32, stop: wp.int32, strength: real, diameter: real, thread: wp.int32
     ): ...
 
-    return SimpleNamespace(load_all=load_all, take=take, leave=leave, solve_single=solve_single)
+    return SimpleNamespace(
+        load_contacts=load_contacts, add_product=add_product, residuals=residuals, solve_single=solve_single
+    )
 
 
 @functools.cache
@@ -84,10 +86,11 @@ def _kernels(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: 
     product = delassus.functions(p, flows, step_pairs, chains, threads).product
     block_sum, block_max = delassus.reductions(p, threads).block_sum, delassus.reductions(p, threads).block_max
     loops = _loops(p, threads)
-    load_all, take, leave, solve_single = loops.load_all, loops.take, loops.leave, loops.solve_single
+    load_contacts, add_product = loops.load_contacts, loops.add_product
+    residuals, solve_single = loops.residuals, loops.solve_single
     secants = quasi_newton.functions(p, threads)
     learn, combine = secants.learn, secants.combine
-    iterations, deep = wp.constant(ITERATIONS), wp.constant(real(DEEP))
+    iterations, deep = wp.constant(CONTACT_ITERATIONS), wp.constant(real(DEEP))
     deepest, per_drag = wp.constant(real(DEEPEST)), wp.constant(real(DIAGONAL_PER_DRAG))
     infinite = wp.constant(real(3.0e38))
     module = p.module("contact_solve", f"{flows.variant}_{step_pairs}_{chains}_{threads}")
@@ -142,22 +145,22 @@ def _kernels(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: 
         thread: wp.int32,
         x: Increment,
     ):
-        """Applies W to the difference of the forces at the solved gaps from those applied so far.
+        """Applies W to the forces at the solved gaps less those applied so far.
 
-        Returns the largest residual, and the square of that difference.
+        Returns the largest residual [um], and the sum of the squares of that difference [pN^2].
         """
         begin = contacts_in.first[c]
         stop = begin + contacts_in.count[c]
-        loaded = load_all(law, begin, stop, model.steric.strength[c], model.steric.diameter[c], thread)
+        loaded = load_contacts(law, begin, stop, model.steric.strength[c], model.steric.diameter[c], thread)
         loaded = block_sum(law, loaded, c, thread)
         if loaded != real(0.0):
             product(model, state, contacts_in, band, flow, law, c, thread)
             first = model.first_node[model.first_flagellum[c]]
             end = model.first_node[model.first_flagellum[c + 1]]
-            take(law, x, begin, stop, first, end, thread)
+            add_product(law, x, begin, stop, first, end, thread)
             if thread == 0:
                 x.body[c] = x.body[c] + law.response.body[c]
-        worst = leave(law, begin, stop, thread)
+        worst = residuals(law, begin, stop, thread)
         return block_max(law, worst, c, thread), loaded
 
     @wp.kernel(module=module)
@@ -211,7 +214,7 @@ def _kernels(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: 
                 any_deep = wp.max(any_deep, deep * diameter - law.solved_gap[i])
                 i += threads
             if block_max(law, any_deep, c, thread) > real(0.0):
-                load_all(law, begin, stop, strength, diameter, thread)
+                load_contacts(law, begin, stop, strength, diameter, thread)
                 i = begin + thread
                 while i < stop:
                     law.wanted[i] = -law.diagonal[i] * law.load[i]

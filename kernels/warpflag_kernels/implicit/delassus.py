@@ -51,18 +51,17 @@ def struct(p: Precision) -> Any:
         answered: wp.array(dtype=real)  # W applied [um]
         change: wp.array(dtype=real)  # W load [um]
         diagonal: wp.array(dtype=real)  # diagonal compliance, an estimate of W's diagonal [um/pN]
-        stiffness_ratio: wp.array(
-            dtype=real
-        )  # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact
+        # d k/(1 + d k), d the diagonal compliance, k the stiffness of the contact.
+        stiffness_ratio: wp.array(dtype=real)
         wanted: wp.array(dtype=real)  # change of gap - d F(gap) that the linear model asks for [um]
         # Secant pairs, see `quasi_newton`: orthonormal vectors, and W less the diagonal applied to them.
-        loads: wp.array(dtype=real)  # [KEPT * capacity]
-        responses: wp.array(dtype=real)  # [KEPT * capacity]
+        loads: wp.array(dtype=real)  # [SECANTS_KEPT * capacity]
+        responses: wp.array(dtype=real)  # [SECANTS_KEPT * capacity]
         # Per element [E], flagellum [K], thread [C * threads of a block].
-        on_first: wp.array(dtype=vec3)  # of segment i [pN]
-        on_second: wp.array(dtype=vec3)
-        on_node: wp.array(dtype=vec3)
-        on_body: wp.array(dtype=vec6)  # [K]
+        on_first: wp.array(dtype=vec3)  # contact force of segment i on its first node [pN]
+        on_second: wp.array(dtype=vec3)  # on its second node [pN]
+        on_node: wp.array(dtype=vec3)  # on a node [pN]
+        on_body: wp.array(dtype=vec6)  # [K], g times a flagellum's load on the body, less s H_bf of its solution
         response: Increment  # Y load
         partial: wp.array(dtype=real)  # every thread's part of a sum or maximum
         # Per cell [C].
@@ -138,7 +137,7 @@ def reductions(p: Precision, threads: int) -> SimpleNamespace:
 
 @functools.cache
 def functions(p: Precision, flows: Flows, step_pairs: str, chains: str, threads: int) -> SimpleNamespace:
-    """Device functions of one block of so many threads: sums and maxima over them, and the product."""
+    """Device function `product` of one block of so many threads: W and Y applied to a load."""
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Band, Contacts, Law = block_band.types(p).Band, contact_list.struct(p), struct(p)
@@ -159,7 +158,7 @@ def functions(p: Precision, flows: Flows, step_pairs: str, chains: str, threads:
 
     @wp.func(module=module)
     def held(flow: Flow, c: wp.int32):
-        """Force and torque of the flow on a body that is held."""
+        """Force [pN] and torque [pN um] of the flow on the body of cell c when it is held."""
         f = flow.shell.force[c]
         t = flow.shell.torque[c]
         return vec6(real(f[0]), real(f[1]), real(f[2]), real(t[0]), real(t[1]), real(t[2]))

@@ -25,6 +25,7 @@ from warpflag_kernels.implicit import stability as stability_stage
 from warpflag_kernels.rod import chain_chart
 
 DIMENSION = 6  # of the Krylov space (docs/numerics.md)
+LEAST_PIVOT = 1.0e-12  # pivot of the least squares below which a direction is left out: round-off of float64
 DIMENSION_AROUND_BODIES = 12  # of that of cells with flow round their bodies, whose modes are coupled more
 
 
@@ -82,7 +83,7 @@ def allocate(model: DeviceModel, dimension: int = DIMENSION) -> Space:
 def _kernels(p: Precision, size: int) -> SimpleNamespace:
     real, Model, State = p.real, structs(p).Model, structs(p).State
     Krylov, Stability, Increment = struct(p), stability_stage.struct(p), chain_chart.types(p).Increment
-    dimension = wp.constant(size)
+    dimension, least_pivot = wp.constant(size), wp.constant(wp.float64(LEAST_PIVOT))
     module = p.module("krylov", "" if size == DIMENSION else str(size))
 
     @wp.kernel(module=module)
@@ -258,7 +259,7 @@ def _kernels(p: Precision, size: int) -> SimpleNamespace:
                 value -= krylov.hessenberg[first + i * (dimension + 2) + j] * krylov.right[right + i]
                 i += 1
             pivot = krylov.hessenberg[first + j * (dimension + 2) + j]
-            if wp.abs(pivot) > wp.float64(1.0e-12):
+            if wp.abs(pivot) > least_pivot:
                 krylov.right[right + j] = value / pivot
             else:
                 krylov.right[right + j] = wp.float64(0.0)
@@ -288,7 +289,7 @@ def solve(
     work: Any,
     x: Any,
 ) -> None:
-    """From P b to the solution with the full mobility, in the cells that `stability` calls strongly coupled; in place.
+    """From P b to the solution with the full mobility, in place, in the cells whose kappa `stability` found large.
 
     b may hold contact forces: what the contact solve has added to x then is P times their velocities.
 
@@ -298,7 +299,7 @@ def solve(
         gain: g, shape [cell_count].
         stability: struct `Stability`.
         space: room for the Krylov space.
-        work: increment to work in, struct `Increment`.
+        work: room for an increment, struct `Increment`.
         x: struct `Increment`.
     """
     kernels, device, cells = _kernels(model.precision, space.dimension), model.device, model.cell_count

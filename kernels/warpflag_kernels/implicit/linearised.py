@@ -1,8 +1,8 @@
 """The linearised equations of a step: the matrix with the local mobility, bodies and flagella together, factorised and
 solved with; and in full, with the pair sum that the matrix leaves out, the product D^-1 (1/dt + g M H) x.
 
-The forces of the product are the first variation of those terms that have one. The stability of a step is measured with
-it, see `stability`.
+The forces of the product are the first variations of those terms that have one. The product serves to measure the
+stability of a step (`stability`) and to solve with the full mobility (`krylov`).
 """
 
 import functools
@@ -58,7 +58,7 @@ def _kernel(p: Precision) -> Any:
 
 
 def allocate(model: DeviceModel, state: DeviceState) -> None:
-    """What the state needs for the first variation of forces beside what forces themselves need."""
+    """Arrays of the struct `State` that the first variation of the forces needs beside those of the forces."""
     state.data.stretch_change = wp.zeros(model.element_count, dtype=model.precision.vec3, device=model.device)
 
 
@@ -122,5 +122,5 @@ def factorise(model: DeviceModel, state: DeviceState, stiffness: Any, band: Any)
 
 
 def solve(model: DeviceModel, state: DeviceState, band: Any, x: Any) -> None:
-    """From D^-1 times velocities (of the bodies: plain velocities) to the increment they cause; in place of them."""
+    """From D^-1 times velocities (of the bodies: velocities) to the increment that they cause, in place."""
     body_coupling.solve(model, state, band, x)

@@ -3,14 +3,14 @@
 The law is not linearised across a step, because it has kinks: a motor whose slope is taken from one side of the knee
 leaps to the other side within a step, where the hook is stiff, and back in the next. Torques are found in their own
 space, as contact forces are. Both iterations of a step evaluate the velocities with the torques known so far and solve
-with the same matrix, in which torques are constant. With what torques then do to the step,
+with the same matrix, in which torques are constant. Changes of the torques then change the rates by
 
     Omega_k = Omega_k^0 + sum_j G_kj (T_j - T_j^0),     Omega: rate at the collocation point, (w delta + e/g)/dt,
 
-every T_k is on its curve, in which it is linear piece by piece. A unit torque on each tripod with the bodies at rest is
-one solution along all flagella at once, t; motors meet through the six unknowns of their body alone. Given its motion
-every motor settles by itself in closed form, and Newton's method finds the motion (`motor/laws.py` does the same at one
-moment, with the tripod's drag in place of the step's matrix).
+and every T_k lies on its curve, which is linear piece by piece. A unit torque on each tripod with the bodies at rest is
+one solution along all flagella at once, t; motors are coupled through the six unknowns of their body alone. Given its
+motion every motor's torque is found by itself in closed form, and Newton's method finds the motion (`motor/laws.py`
+does the same at one moment, with the tripod's drag in place of the step's matrix).
 
 **With thermal noise** the rate of a step scatters by far more than a curve is wide, so a curve has no meaning for it. A
 motor then follows its curve by its rate averaged over a time tau, tau dA/dt = Omega - A, taken implicitly: with s =
@@ -33,7 +33,7 @@ from warpflag_kernels.rod import chain_chart
 
 @functools.cache
 def struct(p: Precision) -> Any:
-    """The struct `MotorSolve`: what torques do to a step. Per flagellum [K] unless said otherwise."""
+    """The struct `MotorSolve`: the response of a step to torques. Per flagellum [K] unless said otherwise."""
     real, vec6, Increment = p.real, chain_chart.types(p).vec6, chain_chart.types(p).Increment
 
     @wp.struct
@@ -76,7 +76,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
     drive_at, settled = law.drive_at, law.settled
     body_rate, inverse6 = body_coupling.functions(p, shell).body_rate, body_coupling.functions(p, shell).inverse6
     follow = block_band.functions(p).follow
-    most = wp.constant(laws.MOST_ITERATIONS)
+    most = wp.constant(laws.MOTOR_ITERATIONS)
     one, zero = wp.constant(real(1.0)), wp.constant(real(0.0))
     module = p.module("motor_solve", "_".join([*["averaged"] * averaged, *["shell"] * shell]))
 
@@ -271,7 +271,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
 
 
 def prepare(model: DeviceModel, state: DeviceState, band: Any, motors: Any) -> None:
-    """What unit torques do to a step, from the factors of its matrix."""
+    """Response of a step to unit torques of the motors, from the factors of its matrix, into `motors`."""
     kernels, device = _kernels(model.precision, model.switches.noise, model.switches.flows.body), model.device
     inputs = [model.data, state.data, motors]
     wp.launch(kernels.load_tripods, model.element_count, inputs=inputs, device=device)
@@ -291,14 +291,14 @@ def solve(
     weight: Any,
     x: Any,
 ) -> None:
-    """Puts every motor on its law: the torques in `State.motor.within_step`, and what their changes do to an increment.
+    """Puts every motor on its law: sets the torques, `State.motor.within_step`, and adds their effect to an increment.
 
     Args:
         model, state: of the batch, with the pose that x is an increment of, at the time of the collocation point.
-        data, band, gain, motors: structs `Implicit` and `Band`, g, and what `prepare` has found.
+        data, band, gain, motors: structs `Implicit` and `Band`, g, and struct `MotorSolve` from `prepare`.
         last, found: the last increment, and what has been found of this one, both at the present pose.
         weight: share of `found` that counts, shape [cell_count].
-        x: what an iteration has found with the torques as they were; changed.
+        x: increment that an iteration has found with the torques as they were; changed in place.
     """
     kernels, device = _kernels(model.precision, model.switches.noise, model.switches.flows.body), model.device
     inputs = [model.data, data, band, gain, last, found, weight, x, state.data, motors]

@@ -1,11 +1,10 @@
-"""The prediction of a step: what the last two increments let one expect of it, how much of that it begins with, and
-what it tells of the step in the end.
+"""The prediction of a step by extrapolation, the share of it with which the first iteration begins, and the error
+estimate, from how far the step ends from its prediction.
 
 A quadratic path through the last three states says what the correction e of a step would be (`collocation`). The first
 iteration begins with a share of it, at the pose R(q, theta w delta + share e): what two iterations leave of the slowly
 converging modes is in proportion to the e that is not known yet, of third order in the step instead of second. The
-share is that of the last step, by least squares over its nodes, and less where the over-implicitness is large. How far
-a step ends from its prediction is what the error estimate follows from.
+share is that of the last step, by least squares over its nodes, and less where the over-implicitness is large.
 """
 
 import functools
@@ -97,7 +96,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         imp: Implicit,
         powers: Balance,
     ):
-        """What a step's flagella tell of it: its error, the share of its prediction, and its power balance."""
+        """Error estimate of a step, share of its prediction in e, and power balance, from sums over its flagella."""
         c = wp.tid()
         if active[c] == 0:
             return
@@ -126,7 +125,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 def predict(
     model: DeviceModel, state: DeviceState, data: Any, last: Any, before: Any, predicted: Any, start: Any
 ) -> None:
-    """Predicts a step where it starts.
+    """Predicts e of a step at its start, and the increment to the pose of the first iteration.
 
     Args:
         model, state: of the batch.

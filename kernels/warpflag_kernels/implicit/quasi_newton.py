@@ -21,8 +21,8 @@ from warpflag_kernels.base.types import DeviceModel
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.implicit.delassus import meet
 
-KEPT = 16  # secant pairs at most; then each new one replaces the oldest. A step makes five to ten products
-SYSTEM_ENTRIES = KEPT * (KEPT + 1)  # entries of the linear system in their span
+SECANTS_KEPT = 16  # secant pairs at most; then each new one replaces the oldest. A step makes five to ten products
+SYSTEM_ENTRIES = SECANTS_KEPT * (SECANTS_KEPT + 1)  # entries of the linear system in their span
 # A pair is kept if at least this fraction of its vector is orthogonal to the earlier ones: the round-off of float32
 # flows is 1e-6 of a product, so the part of W that is learnt from a smaller fraction has few digits.
 INDEPENDENT = 0.1
@@ -34,7 +34,11 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
     real, Law = p.real, delassus.struct(p)
     block_sum = delassus.reductions(p, threads).block_sum
     Reals = wp.array(dtype=real)
-    kept, system_entries, independent = wp.constant(KEPT), wp.constant(SYSTEM_ENTRIES), wp.constant(real(INDEPENDENT))
+    kept, system_entries, independent = (
+        wp.constant(SECANTS_KEPT),
+        wp.constant(SYSTEM_ENTRIES),
+        wp.constant(real(INDEPENDENT)),
+    )
     module = p.module("quasi_newton", str(threads))
 
     @wp.func_native(native(__file__, "weighted_dot", p, THREADS=threads))
@@ -117,9 +121,9 @@ def functions(p: Precision, threads: int) -> SimpleNamespace:
 
 
 def allocate(model: DeviceModel, contacts: Any, law: Any) -> None:
-    """The arrays of the struct `ContactLaw` that the method needs, in place, for as many contacts as there is room."""
+    """Allocates the arrays of the struct `ContactLaw` that the method needs, for as many contacts as there is room."""
     real, device, room = model.precision.real, model.device, len(contacts.gap)
-    law.loads, law.responses = (wp.zeros(KEPT * room, dtype=real, device=device) for _ in range(2))
+    law.loads, law.responses = (wp.zeros(SECANTS_KEPT * room, dtype=real, device=device) for _ in range(2))
     law.wanted = wp.zeros(room, dtype=real, device=device)
     law.small = wp.zeros(SYSTEM_ENTRIES * model.cell_count, dtype=real, device=device)
     law.known = wp.zeros(model.cell_count, dtype=wp.int32, device=device)

@@ -33,14 +33,14 @@ from warpflag_kernels.fluid import body
 from warpflag_kernels.implicit import block_band, linearised
 from warpflag_kernels.rod import chain_chart
 
-LEAST = 1.3  # least over-implicitness, enough for kappa up to 2.6
+LEAST_OVER_IMPLICIT = 1.3  # least over-implicitness, enough for kappa up to 2.6
 OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
-# The over-implicitness falls to no less than this fraction from one measurement to the next: a power iteration
-# approaches the eigenvalue from below.
+# Least ratio of an over-implicitness to the one before: a power iteration approaches the eigenvalue from below.
 LARGEST_FALL = 0.985
-MOST = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step
+# Largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode after a step.
+MOST_OVER_IMPLICIT = 5.0
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
-LARGE_KAPPA = 2.6  # twice LEAST, the limit of stability: from there on the full mobility is solved with
+LARGE_KAPPA = 2.6  # twice LEAST_OVER_IMPLICIT, the limit of stability: from there on the full mobility is solved with
 # The same for flexible cells, whose kappa is a growth: readings up to 13 amid contacts are of sound steps.
 LARGE_KAPPA_OF_FLEXIBLE = 15.0
 # First root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4).
@@ -83,8 +83,7 @@ def struct(p: Precision) -> Any:
 
 
 def allocate(model: DeviceModel) -> Any:
-    """Arrays of the struct `Stability`; the probe has a share of every mode: random, but the same in every run and
-    every cell."""
+    """The struct `Stability`, its probe a random vector with a share of every mode, the same in every run and cell."""
     cells, device = model.cell_count, model.device
     s = struct(model.precision)()
     s.kappa, s.quotient = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(2))
@@ -130,18 +129,17 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
     large_kappa_of_stiff = wp.constant(wp.float64(0.0 if body_flow else LARGE_KAPPA))
     tight, relaxed = wp.constant(wp.float64(TIGHT)), wp.constant(wp.float64(RELAXED))
-    least, most, share, fall = (
-        wp.constant(wp.float64(x)) for x in (LEAST, MOST, OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL)
-    )
+    least, most = (wp.constant(wp.float64(x)) for x in (LEAST_OVER_IMPLICIT, MOST_OVER_IMPLICIT))
+    share, fall = (wp.constant(wp.float64(x)) for x in (OVER_IMPLICIT_PER_KAPPA, LARGEST_FALL))
 
     @wp.func(module=module)
     def flexible_in(stability: Stability, c: wp.int32, step: wp.float64):
-        """Whether no flagellum's longest mode of bending or of stretching is stiff in such steps."""
+        """Whether no flagellum's longest mode of bending or of stretching is stiff in steps of this length [s]."""
         return step * stability.bending_rate[c] <= relaxed and step * stability.stretching_rate[c] <= tight
 
     @wp.func(module=module)
     def weakly_coupled(model: Model, stability: Stability, c: wp.int32, longest_step: wp.float64):
-        """Whether kappa is small at any time: one or two flagella that are flexible in the longest step."""
+        """Whether kappa is always small: one or two flagella that are flexible in the longest step [s]."""
         few = model.first_flagellum[c + 1] - model.first_flagellum[c] <= 2
         return few and flexible_in(stability, c, longest_step)
 
@@ -257,7 +255,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         local += wp.float64(wp.dot(force, velocity) + wp.dot(torque, spin))
         dt = step[c]
         w = over_implicit[c]
-        # In soft modes of a filament under load x.H x may be negative, and then no stiffness is to be had from it.
+        # In soft modes of a filament under load x.H x may be negative: then it says nothing of the stiffness.
         stability.quotient[c] = w
         denominator = stored / dt + w * gain[c] * local
         if denominator > wp.float64(0.0):
@@ -381,8 +379,11 @@ def measure(
     """One power iteration of the cells that are due, and their over-implicitness from it.
 
     Args:
+        model, state: of the batch; the forces and velocities of `state` are overwritten.
+        stiffness, band: at the state's pose.
         gain: g, shape [cell_count].
-        response: increment to work in; the forces of `state` are overwritten.
+        response: room for an increment, struct `Increment`.
+        stability: struct `Stability`.
         over_implicit: shape [cell_count].
         longest_step: as in `schedule`.
     """

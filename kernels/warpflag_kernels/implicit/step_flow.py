@@ -7,7 +7,7 @@ corrected by the second iteration.
 
 Nodes are reordered: the slots of a cell hold its moving nodes, first those that contacts can load, then the others,
 both flagellum after flagellum. A CPU stores the coefficients of every pair (i, j < i) of a cell, row after row, unless
-the cell is so large that reading them takes as long as finding them again (`Plan.step_pairs`).
+the cell is so large that reading them takes as long as computing them (`Plan.step_pairs`).
 """
 
 import functools
@@ -65,9 +65,16 @@ def rows(p: Precision) -> Any:
 
 @functools.cache
 def functions(p: Precision, flows: Flows, step_pairs: str, threads: int = 1) -> SimpleNamespace:
-    """Device functions for one block of threads, in this order, its threads meeting in between: `load` every node,
-    `spread` where pairs are taken once, then `flow_at` any node; for one `Plan.step_pairs`. Threads: those
-    that share what is gathered at a node, one or those of a warp."""
+    """Device functions for one block of threads: `load`, `spread` where pairs are taken once, then `flow_at`.
+
+    They are called in this order, each for all nodes, and the block synchronises in between.
+
+    Args:
+        p: precision of the run.
+        flows: which nodes are coupled.
+        step_pairs: as in `Plan`.
+        threads: that share the pairs gathered at a node: one, or those of a warp.
+    """
     real, vec3, single = p.real, p.vec3, p.single
     Model, Flow = structs(p).Model, struct(p)
     row_of = rows(p)
@@ -297,10 +304,7 @@ def allocate(model: DeviceModel) -> Any:
     flow, device = struct(model.precision)(), model.device
     if model.switches.pairs == "none":
         return flow
-
-    def zeros(count: int, dtype: Any) -> wp.array:
-        return wp.zeros(count, dtype=dtype, device=device)
-
+    zeros = functools.partial(wp.zeros, device=device)
     flow.loaded, flow.start, flow.first_other = (zeros(model.flagellum_count, wp.int32) for _ in range(3))
     flow.node = zeros(model.element_count, wp.int32)
     flow.slot = wp.full(model.element_count, -1, dtype=wp.int32, device=device)
@@ -322,7 +326,13 @@ def allocate(model: DeviceModel) -> Any:
 
 
 def build(model: DeviceModel, state: DeviceState, flow: Any, contacts_in: Any = None) -> None:
-    """Slots, positions and coefficients of the nodes for the present pose; with its contacts, where there are any."""
+    """Slots, positions and pair coefficients of the nodes at the present pose.
+
+    Args:
+        model, state: of the batch.
+        flow: struct `StepFlow`.
+        contacts_in: the listed contacts, struct `Contacts`; None where nothing can touch.
+    """
     kernels = _kernels(model.precision, contacts_in is not None, model.switches.flows, model.plan.by_cells)
     device = model.device
     listed = contact_list.struct(model.precision)() if contacts_in is None else contacts_in
@@ -351,9 +361,8 @@ def _velocity_kernel(p: Precision, flows: Flows) -> Any:
         c = wp.tid()
         if state.active[c] == 0:
             return
-        begin = model.first_node[model.first_flagellum[c]]
+        e = model.first_node[model.first_flagellum[c]]
         end = model.first_node[model.first_flagellum[c + 1]]
-        e = begin
         while e < end:
             if flow.slot[e] >= 0:
                 load(flow, flow.slot[e], state.force[e])
@@ -378,10 +387,10 @@ def stores_pairs(model: DeviceModel) -> bool:
 
 
 def single_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None:
-    """Velocity of every node but r_0 in the lab [um/s], into `velocity`; needs the forces, and with flow round the body
-    its motion, found with the struct `Shell` of `flow`.
+    """Velocity of every node but r_0 in the lab [um/s], in single precision, into `velocity`.
 
     Args:
+        model, state: of the batch, with the forces; with flow round the body, also its motion, found with `flow.shell`.
         flow: the struct `StepFlow`, built for this pose; its forces are overwritten.
     """
     flows = model.switches.flows

@@ -54,8 +54,10 @@ def joint(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def axis_rates(model: Model, state: State, k: wp.int32):
-        """First derivatives of a in the plane across it: by the vector of segment 1, by its spin, and by m, whose
-        changes the minimal rotation of m onto a takes there."""
+        """First derivatives of a, in the plane across it, by the vector of segment 1, by its spin and by m.
+
+        A change of m is taken into that plane by the minimal rotation of m onto a.
+        """
         i = model.first_node[k]
         m = state.pose.tangent[i]
         t = state.pose.tangent[i + 1]
@@ -219,7 +221,7 @@ def add_stiffness(model: DeviceModel, state: DeviceState, stiffness: Any) -> Non
 
 
 def follow(model: DeviceModel, state: DeviceState, chart: Any, _control: Any, _counted: bool) -> None:
-    """Has hooks that stiffen take the torques of their motors; a part of a pass, after the step is committed."""
+    """Sets the torque by which each hook stiffens to that of its motor, once the step has been committed."""
     kernel = _kernels(model.precision).follow
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, chart, state.data], device=model.device)
 
@@ -227,4 +229,4 @@ def follow(model: DeviceModel, state: DeviceState, chart: Any, _control: Any, _c
 HOOK = Term("hook", functions=functions, stiffness=add_stiffness)
 
 HOOK_THAT_STIFFENS = Term("hook that stiffens", after_step=follow, carried=("motor.on_hook",))
-"""No force of its own: the hook goes by what the motor does, whose torque is not constant."""
+"""No force of its own: it keeps the torque by which the hook stiffens, where the motor's torque is not constant."""

@@ -30,9 +30,9 @@ from warpflag_kernels.base.term import Term
 from warpflag_kernels.base.types import structs
 from warpflag_kernels.fluid import body
 
-# Newton steps for the body's angular velocity. Tripods are so light that a motor's torque hardly feels the body: two
-# steps settle it, a third where a motor changes its piece.
-MOST_ITERATIONS = 8
+# Newton steps for the body's angular velocity. A tripod has so little drag that the body's rotation hardly changes its
+# motor's torque: two steps converge, a third is needed where a motor changes its piece.
+MOTOR_ITERATIONS = 8
 
 
 @functools.cache
@@ -105,7 +105,7 @@ def curves(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def twist_bound(model: Model, c: wp.int32):
-        """Bound of the rates of twist of cell c by Gershgorin's theorem, whatever holds its tripods back [1/s]."""
+        """Gershgorin's bound on the relaxation rates of twist in cell c, tripods held back by no motor [1/s]."""
         bound = wp.float64(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
@@ -125,7 +125,7 @@ def _functions(p: Precision) -> SimpleNamespace:
     Model, State = structs(p).Model, structs(p).State
     law, respond = curves(p), body.mobility(p).respond
     drive_at, settled = law.drive_at, law.settled
-    most = wp.constant(MOST_ITERATIONS)
+    most = wp.constant(MOTOR_ITERATIONS)
     zero = wp.constant(real(0.0))
 
     @wp.func(module=p.module("motor_law_functions"))
@@ -193,7 +193,7 @@ def _functions(p: Precision) -> SimpleNamespace:
 
 @functools.cache
 def _functions_within_step(p: Precision) -> SimpleNamespace:
-    """Device functions of the torques that a step holds at present."""
+    """Device functions of the motor as a given torque, `State.motor.within_step`."""
     real, vec3, Model, State = p.real, p.vec3, structs(p).Model, structs(p).State
     module = p.module("held_motor_functions")
 

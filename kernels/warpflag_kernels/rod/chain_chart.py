@@ -35,7 +35,7 @@ def types(p: Precision) -> SimpleNamespace:
 def displacement(p: Precision) -> Any:
     """Device function: the displacement of node e of flagellum k under an increment [um].
 
-    Its argument `position` are the nodes relative to the body centre [um], shape [E]: r_0 follows the body.
+    Its argument `position` holds the nodes relative to the body's centre [um], shape [E]; r_0 moves with the body.
     """
     vec3, Model, Increment = p.vec3, structs(p).Model, types(p).Increment
 

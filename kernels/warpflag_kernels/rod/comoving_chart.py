@@ -29,7 +29,7 @@ def struct(p: Precision) -> Any:
     class Chart:
         base: Pose  # at the start of the step; without lengths and body axis
         flagellum_spin: wp.array(dtype=vec3)  # [K], W [rad/s]
-        # Now.
+        # At the present pose.
         elapsed: wp.array(dtype=wp.float64)  # [C], time since the start of the step [s]
         commit: wp.array(dtype=wp.int32)  # [C], 1: the present pose becomes the start of the next step
         at_start: wp.array(dtype=wp.int32)  # [C], 1: the present pose is the start of a step (its increments vanish)

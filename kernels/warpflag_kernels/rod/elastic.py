@@ -2,14 +2,14 @@
 
 Joint i couples segments i and i + 1 with tangents t, u and strain h Omega = (w1, w2, w3):
 
-    E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|e|/h - 1)^2
+    E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|s|/h - 1)^2
 
 (the paper's Kirchhoff density; its stretching term has no rest length as printed, here it has one). The motor
 joint 0 is a universal joint: no bending rigidity, no intrinsic twist, `hook_rigidity` in place of C. Directors follow
 a moving tangent by the minimal rotation, so gradients are taken with respect to segment vectors and spin angles.
 
-The bearing of the universal joint hands the torque -m x dE/de_0 to the body, the part of the joint's torque across the
-motor axis m, which the paper's form leaves out; it is a term of its own.
+The bearing of the universal joint hands the torque -m x dE/ds_0 to the body, the part of the joint's torque across the
+motor axis m, which the paper's form leaves out; it is a term of its own. s is a segment's vector; s_0 stands for m.
 """
 
 import functools
@@ -222,8 +222,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def joint_gradients(model: DeviceModel, state: DeviceState) -> None:
-    """Energy gradients of every joint, into `joint_before/after` [pN], of the hook's tripod [pN um], and
-    `joint_spin_before/after` [pN um]."""
+    """Energy gradients of every joint: by segment vectors into `joint_before/after` [pN], by spins into
+    `joint_spin_before/after` [pN um]; that of the hook by the unit vector m is a torque [pN um]."""
     kernel = _kernels(model.precision).joint_gradients
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
 

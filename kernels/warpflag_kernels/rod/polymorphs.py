@@ -12,8 +12,8 @@ little: a joint of semicoiled form amid the normal one has an eighth of it, and 
 thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels; near
 the ends over less, as much to either side, so that it is the moment at the joint.
 
-From some moment on that the scene has drawn, joints of form 1 go on to form 2, one after the other from the root, as
-long as the motor winds up. They flip back to form 0 as those of form 1 do.
+From times on that are drawn before the run begins, joints of form 1 go on to form 2, one after the other from the root,
+as long as the motor winds the filament up. They flip back to form 0 as those of form 1 do.
 
 A joint's ground state goes over within a ramp, as a smooth step, so that the steppers see quadratic energies that
 change with time. Joints are looked at where a step has been accepted, and neither flip nor lead to a flip while their
@@ -163,7 +163,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Out:
         state: State,
     ):
-        """Flips joints of a flagellum at the end of an accepted step; `counted`: the clock stands there."""
+        """Flips joints of a flagellum at the end of an accepted step; `counted`: whether the clock has reached that."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
@@ -227,7 +227,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def ground_states(model: DeviceModel, state: DeviceState) -> None:
-    """Ground states of all joints at the time of the evaluation, where the elastic term looks for them."""
+    """Ground states of all joints at the time of the evaluation, into `rest_strain`, which the elastic term reads."""
     kernel = _kernels(model.precision).ground_states
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)
 
@@ -237,7 +237,7 @@ def flip(model: DeviceModel, state: DeviceState, chart: Any, control: Any, count
 
     Args:
         model, state, chart, control: of the batch.
-        counted: whether the step is in the clocks already.
+        counted: whether the clocks have been advanced to the end of the step.
     """
     inputs = [model.data, chart, control, int(counted), state.data]
     wp.launch(_kernels(model.precision).flip, model.flagellum_count, inputs=inputs, device=model.device)

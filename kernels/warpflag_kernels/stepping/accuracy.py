@@ -1,14 +1,15 @@
-"""What accuracy a run has kept: the error estimates of its steps added up on the device, per cell.
+"""The accuracy that a run has kept: the error estimates of its steps, added up per cell on the device.
 
 A step of dt may err by `may_make`, which grows as dt^p, p = 1 for errors of equal sign and 1/2 for independent ones.
-Independent are errors that lie farther apart than `CORRELATION`: within that time steps err alike, so shorter ones may
-err in proportion to dt. With r the estimate over what a step may make, the errors of steps add up to the share
+Errors are independent where they lie farther apart than `CORRELATION`: within that time they have equal sign, so a
+shorter step may err in proportion to dt. With r the estimate over what a step may make, the errors of steps add up to
+the share
 
     [sum of dt r^(1/p) / time]^p
 
 of what was asked for the same time: the mean of r for p = 1, its root mean square for p = 1/2. It is kept for the whole
 run, for windows of `WINDOW`, of which the worst is remembered, and for the present millisecond, in which a run that has
-erred by `BEYOND` times what a whole millisecond may is stopped, unless its scene says otherwise.
+erred by `LARGEST_EXCESS` times what a whole millisecond may is stopped, unless its scene says otherwise.
 """
 
 import functools
@@ -19,13 +20,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-SPAN = 1.0e-3  # time that the accuracy refers to: independent errors add up to it in this time [s]
+SPAN = 1.0e-3  # time that the accuracy refers to: errors of steps may add up to it in this time [s]
 CORRELATION = 5.0e-6  # time within which errors of steps have equal sign where they are otherwise independent [s]
 WINDOW = 1.0e-4  # time over which the worst estimate is taken [s]: some ten steps and more
-# Steps of the shortest length that are not counted after the start of a scene, 1 us in water: what the start leaves
-# stretched and pressed relaxes then, and estimates see that as error.
-BEGIN = 50.0
-BEYOND = 10.0  # estimate over what was asked at which a run is stopped
+# Shortest steps after the start of a scene that are not counted, 1 us in water: what the start leaves stretched or in
+# contact relaxes in them, which the estimates take for error.
+UNCOUNTED_STEPS = 50.0
+LARGEST_EXCESS = 10.0  # estimate over what was asked at which a run is stopped
 
 
 @wp.struct
@@ -42,11 +43,11 @@ class Achieved:
     worst_end: wp.array(dtype=wp.float64)  # its end [s]
     span: wp.array(dtype=wp.float64)  # sum of the present `SPAN`
     span_time: wp.array(dtype=wp.float64)  # [s]
-    at_shortest: wp.array(dtype=wp.int32)  # steps that the estimate wanted shorter than the shortest that it may
+    at_shortest: wp.array(dtype=wp.int32)  # steps of the shortest length whose estimate exceeds what they may make
 
 
 SUMS = ("total", "total_time", "window", "window_time", "worst", "worst_end", "span", "span_time")
-"""What goes on from step to step, beside `at_shortest`."""
+"""Names of the sums, which checkpoints carry on beside `at_shortest`."""
 
 
 def allocate(accuracies: Sequence[float], stopping: Sequence[bool], device: Any) -> Achieved:
@@ -59,7 +60,7 @@ def allocate(accuracies: Sequence[float], stopping: Sequence[bool], device: Any)
     """
     a = Achieved()
     a.asked = wp.array(np.array(accuracies) * 1e3, dtype=wp.float64, device=device)
-    a.limit = wp.array(np.where(stopping, BEYOND, 0.0), dtype=wp.float64, device=device)
+    a.limit = wp.array(np.where(stopping, LARGEST_EXCESS, 0.0), dtype=wp.float64, device=device)
     for name in SUMS:
         setattr(a, name, wp.zeros(len(accuracies), dtype=wp.float64, device=device))
     a.at_shortest = wp.zeros(len(accuracies), dtype=wp.int32, device=device)
@@ -70,14 +71,14 @@ def allocate(accuracies: Sequence[float], stopping: Sequence[bool], device: Any)
 def functions(independent: bool) -> SimpleNamespace:
     """Device functions of errors that are independent from step to step, or of equal sign.
 
-    `may_make` is the error that a step may make, `longest` the step whose estimate level dt^3 is that, `add` counts an
-    estimate.
+    `may_make` is the error that a step may make, `longest` the step whose estimate, level dt^3, is that error, and
+    `add` counts an estimate.
     """
     name = "independent" if independent else "systematic"
     module = wp.get_module(f"warpflag_kernels.accuracy_{name}")
     scale, root = (wp.constant(wp.float64(x)) for x in ((SPAN**0.5, 1.0 / 2.5) if independent else (1.0, 0.5)))
     alike = wp.constant(wp.float64((SPAN / CORRELATION) ** 0.5))
-    span, window, begin = (wp.constant(wp.float64(x)) for x in (SPAN, WINDOW, BEGIN))
+    span, window, begin = (wp.constant(wp.float64(x)) for x in (SPAN, WINDOW, UNCOUNTED_STEPS))
 
     @wp.func(module=module)
     def rooted(x: wp.float64):
@@ -103,7 +104,7 @@ def functions(independent: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def add(a: Achieved, c: wp.int32, dt: wp.float64, error: wp.float64, time: wp.float64, shortest: wp.float64):
-        """Counts the estimate of an accepted step [um]; whether that is beyond the limit.
+        """Counts the estimate of an accepted step, `error` [um]; returns whether that goes beyond the limit.
 
         Args:
             time: at the end of the step [s].

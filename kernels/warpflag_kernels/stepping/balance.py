@@ -1,4 +1,4 @@
-"""The power balance of a step: what the motors and all else from outside put in is dissipated or stored.
+"""The power balance of a step: the work of motors, contacts and external forces is dissipated or stored.
 
 A step takes the displacement x. With the energy U of the terms that store some (`Term.functions`, `energy`) and the
 forces F of all others at the pose that the second iteration evaluates,
@@ -16,9 +16,9 @@ none can be forgotten.
 The first step after a start has no energy before it and is not judged.
 
 Where ground states change with time, on the ramps of polymorphs, energy is put in at a pose that stands still: in a
-step -m.change, joint by joint, with the mean m of the moments before and after. Stiff joints follow their ground state,
-so that with the moment before alone they would seem to take in and dissipate k change^2/2, and with that after to give
-as much away. With any moment between the two it differs by at most |dm|.|change|/2, which is allowed, too.
+step -m.change, joint by joint, with the mean m of the moments before and after. Stiff joints follow their ground state:
+the moment before alone would count k change^2/2 too much, that after alone as much too little. Another moment between
+the two changes the sum by at most |dm|.|change|/2, which is allowed, too.
 """
 
 import functools
@@ -40,9 +40,9 @@ from warpflag_kernels.rod import chain_chart, comoving_chart, polymorphs, rotati
 MOST_DISSIPATED = 2.0
 # Round-off of the energy, over the bound above: strains come from some operations each.
 ENERGY_ROUND_OFF = 4.0
-# A violation counts as WEIGHT steps that keep the balance: where more than one step in ten violates it, the count
-# grows, and beyond LASTING, some twenty violations more than that, the cell is stopped.
-WEIGHT = 9
+# A violation counts as VIOLATION_WEIGHT steps that keep the balance: where more than one step in ten violates it, the
+# count grows, and beyond LASTING, some twenty violations more than that, the cell is stopped.
+VIOLATION_WEIGHT = 9
 LASTING = 200
 
 
@@ -60,7 +60,7 @@ def struct(p: Precision) -> Any:
         work: wp.array(dtype=wp.float64)  # [K], of the terms that store no energy [pN um]
         energy: wp.array(dtype=wp.float64)  # [K], after the step [pN um]
         stored: wp.array(dtype=wp.float64)  # [C], before it [pN um]
-        stored_after: wp.array(dtype=wp.float64)  # [C], that after it, of all flagella [pN um]
+        stored_after: wp.array(dtype=wp.float64)  # [C], after it, of all flagella [pN um]
         all_off: wp.array(dtype=wp.float64)  # [C], energy if every strain were 1 off its rest value [pN um]
         kept: wp.array(dtype=wp.int32)  # [C], 1: the step keeps the balance
         # Where ground states change, what that adds to the energy in the step.
@@ -68,13 +68,13 @@ def struct(p: Precision) -> Any:
         ramped_within: wp.array(dtype=wp.float64)  # [K], to within this [pN um]
         known: wp.array(dtype=wp.int32)  # [C], 1: `stored` is that of the present state
         refused: wp.array(dtype=wp.int32)  # [C], steps that violated the balance so far
-        lasting: wp.array(dtype=wp.int32)  # [C], WEIGHT times these, less the steps that have kept it
+        lasting: wp.array(dtype=wp.int32)  # [C], VIOLATION_WEIGHT times these, less the steps that have kept it
 
     return Balance
 
 
 CARRIED = ("stored", "known", "refused", "lasting")
-"""What goes on from step to step."""
+"""Arrays that carry over from one step to the next, and into checkpoints."""
 
 
 def ramps(model: DeviceModel) -> bool:
@@ -211,13 +211,13 @@ def functions(p: Precision) -> SimpleNamespace:
     module = p.module("balance_functions")
     most = wp.constant(wp.float64(MOST_DISSIPATED))
     round_off = wp.constant(wp.float64(ENERGY_ROUND_OFF * 2.0 * np.finfo(p.name).eps))
-    weight, lasting = wp.constant(wp.int32(WEIGHT)), wp.constant(wp.int32(LASTING))
+    weight, lasting = wp.constant(wp.int32(VIOLATION_WEIGHT)), wp.constant(wp.int32(LASTING))
 
     @wp.func(module=module)
     def judge(
         first_flagellum: wp.array(dtype=wp.int32), balance: Balance, c: wp.int32, dt: wp.float64, error: wp.float64
     ):
-        """Whether a step of dt, which may err by `error` [um], keeps the balance; and the energy after it."""
+        """Whether a step of dt, which may err by `error` [um], keeps the balance, into `kept`; sets `stored_after`."""
         zero = wp.float64(0.0)
         work = zero
         energy = zero
@@ -243,7 +243,7 @@ def functions(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def count(balance: Balance, c: wp.int32, good: wp.bool):
-        """Counts a judged step; whether violations have gone on for too long."""
+        """Counts a judged step; returns whether violations have gone on for too long."""
         if good:
             balance.lasting[c] = wp.max(balance.lasting[c] - 1, 0)
             return False
@@ -260,13 +260,13 @@ def storing(model: DeviceModel) -> tuple[Term, ...]:
 
 
 def gather(model: DeviceModel, state: DeviceState, balance: Any) -> None:
-    """Takes up forces and velocities of the present pose, where they have just been evaluated."""
+    """Stores loads and power of the present pose, at which forces and velocities have just been evaluated."""
     kernel = _kernels(model.precision, storing(model)).gather
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data, balance], device=model.device)
 
 
 def weigh(model: DeviceModel, state: DeviceState, total: Any, balance: Any) -> None:
-    """Work of these forces on a step's increment, and the energy at its end, the present pose.
+    """Work of the forces that `gather` has stored on a step's increment, and the energy at its end, the present pose.
 
     Args:
         model, state: of the batch.
@@ -335,7 +335,7 @@ def _ramp_kernel(p: Precision) -> Any:
 
 
 def add_up_ramps(model: DeviceModel, state: DeviceState, chart: Any, control: Any, balance: Any) -> None:
-    """What changes of ground states have added to the energy in a step, and the energy with those at its end.
+    """Energy that changing ground states have put in during a step; that at its end is corrected to the final ones.
 
     Args:
         model, state, chart, control: of the batch; after `weigh`, before the step is judged.

@@ -1,7 +1,7 @@
 """Dense output: the frames of a record are taken from inside steps, on the device, and no step ends at their times.
 
 Frames that fall into an accepted step are measured on its path (`step_path`) and stored in slots (`frame_slots`), which
-the host reads in blocks: they cost neither steps nor looks from the host, and steps do not depend on them.
+the host reads in blocks: frames cost no steps and no transfers of their own, and steps do not depend on them.
 """
 
 import functools
@@ -49,7 +49,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         # Out:
         dense: Dense,
     ):
-        """Whether a frame falls into the step that was just accepted; `counted`: the clock stands at its end."""
+        """Whether a frame falls into the step just accepted; `counted`: whether the clock has reached its end."""
         c = wp.tid()
         dense.due[c] = 0
         if state.active[c] == 0 or chart.commit[c] == 0 or control.fault[c] != no_fault:
@@ -135,7 +135,7 @@ def take(
     Args:
         model, state, chart, control: of the batch.
         dense: the slots.
-        counted: whether the step is in the clocks already.
+        counted: whether the clocks have been advanced to the end of the step.
     """
     path, device = step_path.kernels(model.precision), model.device
     inputs = [state.data, chart, control, int(counted), dense.data]

@@ -41,12 +41,12 @@ def _kernels() -> SimpleNamespace:
 
 
 def of_stage(state: DeviceState, control: Any, chart: Any, device: Any) -> None:
-    """Of the present stage of every cell: its time since the start of the step later than the step."""
+    """Sets `State.time` to that of the present stage of every cell: start of the step plus the stage's elapsed time."""
     inputs = [control.time, chart.elapsed, state.data.time]
     wp.launch(_kernels().of_stage, len(control.time), inputs=inputs, device=device)
 
 
 def within_step(state: DeviceState, control: Any, theta: wp.array, device: Any) -> None:
-    """Of the collocation point of every cell: a fraction theta of its step."""
+    """Sets `State.time` to that of the collocation point of every cell, the fraction theta of its step."""
     inputs = [control.time, control.step, theta, state.data.time]
     wp.launch(_kernels().within_step, len(control.time), inputs=inputs, device=device)

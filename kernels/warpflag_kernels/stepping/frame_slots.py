@@ -11,7 +11,7 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, allocate_pose,
 from warpflag_kernels.contact import neighbours
 from warpflag_kernels.rod.comoving_chart import vec6d
 
-MOST_SLOTS = 256  # frames of a cell between two looks from the host
+MOST_SLOTS = 256  # frames of a cell between two transfers to the host
 MOST_BYTES = 1 << 26  # of all slots together
 
 
@@ -81,7 +81,7 @@ class DenseOutput:
         return int(self.data.slots)
 
     def memory(self) -> dict[str, Any]:
-        """What goes from step to step, arrays by name."""
+        """Arrays, by name, that carry over from one step to the next, and into checkpoints."""
         pose = ("position", "tangent", "director", "body_position", "body_orientation")
         kept = {name: getattr(self.data.before, name) for name in pose}
         return {**kept, "step_before": self.data.step_before}
@@ -116,7 +116,7 @@ def allocate(model: DeviceModel, state: DeviceState) -> DenseOutput:
     d.motor_torque = zeros(m * flagella if model.switches.has("motor law") else 0, p.real)
 
     own = structs(p).State()
-    for name in own._cls.vars:  # measures read nothing of the rest
+    for name in own._cls.vars:  # what is measured on frames reads none of the others
         if name not in ("pose", "active"):
             setattr(own, name, getattr(state.data, name))
     allocate_pose(p, cells, elements, device, own.pose)

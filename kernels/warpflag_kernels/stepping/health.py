@@ -3,7 +3,7 @@
 A step too long, or a load too strong, gives wrong finite numbers long before it gives NaN. So at a start, every
 `interval` steps and at the end of an advance, these kernels check the state and record the first violated guard of
 each cell; the stepper then stops that cell. Crossings are found by moving both segments of a near pair linearly from
-the last check to this one: at the times when the four end points are coplanar, do they touch, if they can at all?
+the last check to this one: they have crossed if they touch at a time at which their four ends are coplanar.
 """
 
 import functools
@@ -188,12 +188,12 @@ def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
         )
 
     @wp.func(module=module)
-    def farthest(model: Model, ways: wp.array(dtype=real), c: wp.int32):
-        """The largest of these displacements of the flagella of cell c."""
+    def farthest(model: Model, displacements: wp.array(dtype=real), c: wp.int32):
+        """The largest displacement of a node of cell c, from those of its flagella [um]."""
         longest = real(0.0)
         k = model.first_flagellum[c]
         while k < model.first_flagellum[c + 1]:
-            longest = wp.max(longest, ways[k])
+            longest = wp.max(longest, displacements[k])
             k += 1
         return longest
 
@@ -354,7 +354,7 @@ def check(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, contro
 
 
 def remember(model: DeviceModel, state: DeviceState, chart: Any, guard: Any, control: Control) -> None:
-    """Stores the checked positions, from which the next check follows the segments."""
+    """Stores the checked positions, from which the next check moves the segments on."""
     if model.switches.steric:
         inputs = [model.data, state.data, control, chart, guard]
         kernel = _kernels(model.precision, model.switches.self_contact).remember

@@ -4,7 +4,7 @@ Stage by stage, a launch or more for each, or a whole cell in one launch by one 
 of a launch one after the other, and every launch costs it what some ten nodes do. Both call the same device functions
 in the same order, so the numbers are the same.
 
-An implicit step gives the contact forces instead of having them evaluated (`launch_with_contacts`).
+In an implicit step contact forces are given, and not evaluated (`launch_with_contacts`).
 """
 
 import functools

@@ -25,7 +25,7 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.motor import laws as motor_laws
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
-from warpflag_kernels.stepping import accuracy, chebyshev, step_control
+from warpflag_kernels.stepping import chebyshev, step_control
 from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.stepping.rkc_arrays import struct
 from warpflag_kernels.stepping.step_control import StepControl
@@ -35,14 +35,9 @@ STAGE_FACTOR = 1.54  # stages: 1 + (1 + 1.54 dt spectral radius)^1/2, as in the 
 # Norm of the probe, spins in rad, displacements in segment lengths: well above the root of
 # the unit round-off, at which truncation and round-off of a difference are alike; measured (docs/numerics.md).
 PROBE_SIZE = {"float64": 1.0e-6, "float32": 1.0e-3}
-EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last place of 1
 # The power method approaches the spectral radius from below; the margin also covers its growth within a step.
 RADIUS_MARGIN = 1.15
 FIRST_PROBES = 40  # iterations of the power method after a start, from a random vector
-# Share of the embedded estimate (0.8 and 0.4 in the paper above) that counts: errors of runs are then 0.02 to 0.6 of
-# what the accuracy allows (docs/numerics.md).
-ESTIMATE_SHARE = 0.1
-NOISE = 5.0  # an estimate below this times its usual round-off is taken to be round-off
 MOST_STAGES = 1.0e4  # a stiffer state is not resolved: the step is taken, unstable, and the guards stop the cell
 
 
@@ -51,29 +46,24 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
     real, vec4 = p.real, p.vec4
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
-    f = step_control.functions(p, independent=False)
-    accept, next_step, smallest = f.accept, f.next_step, f.smallest
-    add_estimate = accuracy.functions(independent=False).add
+    next_step = step_control.functions(p, independent=False).next_step
     advanced, coefficients = clock.functions().advanced, chebyshev.functions().coefficients
     module = p.module("euler" if euler else "rkc", "_".join([*["motor_law"] * motor_law, *["cells"] * by_cells]))
-    damping, safety, probe_size = (wp.constant(wp.float64(x)) for x in (DAMPING, RADIUS_MARGIN, PROBE_SIZE[p.name]))
-    weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * NOISE))
-    rate_weight, increment_weight, noise_weight = (wp.constant(real(x)) for x in weights)
-    stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
-    epsilon = wp.constant(real(EPSILON[p.name]))
-    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
-    no_fault, inaccurate, unstable = (
-        wp.constant(wp.int32(x)) for x in (NO_FAULT, encode(Fault.ACCURACY), encode(Fault.UNSTABLE))
+    damping, radius_margin, probe_size = (
+        wp.constant(wp.float64(x)) for x in (DAMPING, RADIUS_MARGIN, PROBE_SIZE[p.name])
     )
-
+    stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
+    tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
+    no_fault, unstable = wp.constant(wp.int32(NO_FAULT)), wp.constant(wp.int32(encode(Fault.UNSTABLE)))
     twist_bound = motor_laws.curves(p).twist_bound
 
     @wp.func(module=module)
     def outgrown(control: Control, rkc: Rkc, c: wp.int32):
-        """Whether the last fixed step ended where its stages are too few, or the next one needs more than there are."""
+        """Whether fixed steps are unstable: the last one had too few stages for the spectral radius at its end, or the
+        next one would take more than MOST_STAGES."""
         s = wp.float64(rkc.stages[c])
         ended = rkc.spectral_radius[c] * control.step[c] > (s * s - wp.float64(1.0)) / stage_factor
-        next = stage_factor * safety * rkc.spectral_radius[c] * control.longest_step[c]
+        next = stage_factor * radius_margin * rkc.spectral_radius[c] * control.longest_step[c]
         return (control.steps[c] > 0 and ended) or next > most_stages * most_stages
 
     @wp.func(module=module)
@@ -100,9 +90,9 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
                 rkc.stages[c] = 1
             else:
                 radius = rkc.spectral_radius[c]
-                if wp.static(motor_law):  # on its plateau a motor lets the tripod go at once
+                if wp.static(motor_law):  # a motor on its plateau no longer holds the tripod
                     radius = wp.max(radius, twist_bound(model, c))
-                stiffness = safety * radius * control.step[c]
+                stiffness = radius_margin * radius * control.step[c]
                 wanted = wp.min(wp.sqrt(one + stage_factor * stiffness), most_stages)
                 rkc.stages[c] = 1 + wp.max(wp.int32(wanted), 1)
         s = rkc.stages[c]
@@ -197,69 +187,6 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
         if state.active[c] != 0:
             combine_element(rkc, chart, e, c)
 
-    @wp.kernel(module=module)
-    def estimate_error(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        control: Control,
-        chart: Chart,
-        # Out:
-        rkc: Rkc,
-    ):
-        k = wp.tid()
-        e = model.first_node[k]
-        c = model.cell_of[e]
-        if state.active[c] == 0 or chart.commit[c] == 0:
-            return
-        # A share of the embedded estimate 4/5 (Y_0 - Y_s) + 2/5 dt (F_0 + F_s), all in the chart of this step.
-        dt = real(control.step[c])
-        last = model.first_node[k + 1] - 1
-        worst = real(0.0)
-        while e <= last:
-            d = rate_weight * dt * (rkc.start_rate[e] + chart.rate[e]) - increment_weight * chart.increment[e]
-            worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
-            e += 1
-        # Rates carry the round-off of positions times the stiffness of the stretch; below NOISE times that an estimate
-        # is taken to be round-off.
-        reach = real(last - model.first_node[k]) * model.rod.segment_length[k]
-        force = epsilon * reach * model.rod.stretching_stiffness[k] / model.rod.segment_length[k]
-        rkc.noise[k] = noise_weight * dt * model.drag.mobility_along[last] * force
-        rkc.error[k] = worst
-
-    @wp.kernel(module=module)
-    def decide(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        rkc: Rkc,
-        # Out:
-        control: Control,
-        steps: StepControl,
-        chart: Chart,
-    ):
-        c = wp.tid()
-        if state.active[c] == 0 or chart.commit[c] == 0:
-            return
-        error = wp.float64(0.0)
-        noise = wp.float64(0.0)
-        k = model.first_flagellum[c]
-        while k < model.first_flagellum[c + 1]:
-            error = wp.max(error, wp.float64(rkc.error[k]))
-            noise = wp.max(noise, wp.float64(rkc.noise[k]))
-            k += 1
-        sound = control.fault[c] == no_fault and wp.isfinite(error)
-        fixed = steps.error_rate[c] <= wp.float64(0.0)
-        if accept(steps, c, control.step[c], error, noise, sound, True):
-            if add_estimate(steps.achieved, c, control.step[c], error, advanced(control, c), steps.shortest[c]):
-                control.fault[c] = inaccurate
-        elif not fixed and control.step[c] > smallest:
-            control.fault[c] = no_fault
-            chart.commit[c] = 0
-            chart.at_start[c] = 0
-
     @wp.func(module=module)
     def keep_flagellum(model: Model, chart: Chart, rkc: Rkc, k: wp.int32, c: wp.int32):
         """Rates of flagellum k that later passes need."""
@@ -347,8 +274,6 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
     return SimpleNamespace(
         schedule=schedule,
         combine=combine,
-        estimate_error=estimate_error,
-        decide=decide,
         keep=keep,
         turn_over=turn_over,
     )
@@ -368,15 +293,6 @@ def begin_pass(
     if not model.plan.by_cells:
         inputs = [model.data, state.data, rkc, chart]
         wp.launch(kernels.combine, model.element_count, inputs=inputs, device=model.device)
-
-
-def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, steps: StepControl, rkc: Any) -> None:
-    """Estimates the error of every completed step and clears `commit` where the step is rejected."""
-    kernels = _kernels_of(model, euler=False)
-    inputs = [model.data, state.data, control, chart, rkc]
-    wp.launch(kernels.estimate_error, model.flagellum_count, inputs=inputs, device=model.device)
-    inputs = [model.data, state.data, rkc, control, steps, chart]
-    wp.launch(kernels.decide, model.cell_count, inputs=inputs, device=model.device)
 
 
 def end_pass(model: DeviceModel, state: DeviceState, chart: Any, control: Control, rkc: Any, euler: bool) -> None:

@@ -30,7 +30,7 @@ def struct(p: Precision) -> Any:
         probe_norm: wp.array(dtype=wp.float64)  # [C]
         probe_sum: wp.array(dtype=wp.float64)  # [K], squared norm of the flagellum's part
         error: wp.array(dtype=real)  # [K], largest node error estimate [um]
-        noise: wp.array(dtype=real)  # [K], below which it is lost in round-off [um]
+        round_off: wp.array(dtype=real)  # [K], an estimate below this is taken to be round-off [um]
         spectral_radius: wp.array(dtype=wp.float64)  # [C] [1/s]
         coefficients: wp.array(dtype=wp.vec4d)  # [C]: mu, nu, and m dt, g dt [s]
         evaluations: wp.array(dtype=wp.int32)  # [C], right-hand sides so far
@@ -52,5 +52,5 @@ def allocate(model: DeviceModel) -> Any:
     r.stage, r.stages, r.probes_left, r.evaluations = (zeros(cells, wp.int32) for _ in range(4))
     r.probe_norm, r.spectral_radius = zeros(cells, wp.float64), zeros(cells, wp.float64)
     r.probe_sum, r.coefficients = zeros(flagella, wp.float64), zeros(cells, wp.vec4d)
-    r.error, r.noise = zeros(flagella, p.real), zeros(flagella, p.real)
+    r.error, r.round_off = zeros(flagella, p.real), zeros(flagella, p.real)
     return r

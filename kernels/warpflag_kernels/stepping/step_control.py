@@ -31,11 +31,12 @@ LARGEST_GROWTH = 2.0
 REJECTED = 5.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
 # The same for errors of equal sign, those of RKC. In float32 they are round-off that shorter steps don't lower.
 REJECTED_SYSTEMATIC = 25.0
-SAFETY = 0.8  # the weighted mean of the estimates is kept at this fraction of what is allowed
+SAFETY = 0.8  # fraction of the allowed error at which the weighted mean of the estimates is kept
 FADING_STEPS = 20.0  # over how many steps that mean fades
-FADING_TIME = 5.0e-4  # time constant for errors of equal sign [s]: in float32 some last estimates above round-off
-# Shortest steps in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in water as
-# long as FADING_TIME, in thinner fluids shorter.
+# Time constant of the mean for errors of equal sign [s]: in float32 it spans the last estimates above round-off.
+FADING_TIME = 5.0e-4
+# Time, in shortest steps, in which the rate that steps aim at falls to 1/e where they err by twice what was asked: in
+# water as long as FADING_TIME, in thinner fluids shorter.
 LOWERING = 25000.0
 LOWEST = 1.0e-2  # of that rate, over what was asked: steps are then a tenth as long
 FORGOTTEN = 0.02  # the mean is dropped when its total weight has fallen below this fraction of its memory
@@ -51,7 +52,7 @@ SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be solved here ends the cell's
 
 @wp.struct
 class StepControl:
-    """Per cell [C]."""
+    """Settings and memory of step control, per cell [C]."""
 
     error_rate: wp.array(dtype=wp.float64)  # allowed error per simulated time [um/s]; 0: fixed step
     wanted_step: wp.array(dtype=wp.float64)  # [s]
@@ -123,7 +124,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
 
         Args:
             error: estimate of this step [um]; `known` says whether there is one.
-            lost: an estimate below this is round-off, and only says that the error is below [um].
+            lost: an estimate below this is round-off, and says only that the error is below it [um].
             sound: the step was solved and violates no guard.
         """
         one = wp.float64(1.0)

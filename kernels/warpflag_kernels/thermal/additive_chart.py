@@ -38,11 +38,11 @@ def struct(p: Precision) -> Any:
 
     @wp.struct
     class Additive:
-        node: wp.array(dtype=vec3)  # [E], relative to where the body's centre was [um]
+        node: wp.array(dtype=vec3)  # [E], relative to the body's centre at the start of the step [um]
         length: wp.array(dtype=real)  # [E], that the segment shall have [um]
         ratio: wp.array(dtype=real)  # [E], of the elimination along a flagellum
         tension: wp.array(dtype=real)  # [E], times the step [pN s]
-        owed: wp.array(dtype=real)  # [E], the sum of those of the last step, which the next one takes back [pN s]
+        owed: wp.array(dtype=real)  # [E], sum of the tensions of a step, which the next one takes back [pN s]
         pull: wp.array(dtype=vec3)  # [K], on the anchor, times the step [pN s]
 
     return Additive
@@ -59,7 +59,7 @@ def allocate(model: DeviceModel) -> Any:
 
 
 @functools.cache
-def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
+def _kernels(p: Precision, free: bool, motor_law: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
     Increment, Additive, Noise = chain_chart.types(p).Increment, struct(p), noise_stage.struct(p)
@@ -68,7 +68,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
     respond = body_stage.mobility(p).respond
-    module = p.module("additive_chart", "free" * free + "lawful" * lawful)
+    module = p.module("additive_chart", "free" * free + "motor_law" * motor_law)
 
     @wp.kernel(module=module)
     def move_bodies(
@@ -123,7 +123,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def respond_node(model: Model, chart: Chart, e: wp.int32, k: wp.int32, force: vec3):
-        """Local mobility of node e at the start of the step on a force."""
+        """Displacement of node e by a force times the step [pN s], with the local mobility at the start [um]."""
         t = chart.base.tangent[e]
         if e + 1 < model.first_node[k + 1]:
             t = wp.normalize(t + chart.base.tangent[e + 1])
@@ -132,7 +132,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
 
     @wp.func(module=module)
     def anchor_of(model: Model, state: State, chart: Chart, k: wp.int32, c: wp.int32):
-        """Where the anchor of flagellum k is, relative to where the body's centre was."""
+        """Position of the anchor of flagellum k relative to the body's centre at the start of the step [um]."""
         shift = vec3(state.pose.body_position[c] - chart.base.body_position[c])
         return shift + attached(state.pose.body_orientation[c], model.motor.anchor[k])
 
@@ -302,7 +302,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
             state.pose.body_axis[c] = body_axis(orientation)
         spin = x.node[e][3]
         carried = transport(chart.base.director[e], chart.base.tangent[e], t)
-        if wp.static(lawful) and e == first and model.motor_law[0].prescribed[k] != 0:
+        if wp.static(motor_law) and e == first and model.motor_law[0].prescribed[k] != 0:
             # The tripod keeps to its rate against the body as it has turned in the end.
             turned = orientation * wp.quat_inverse(chart.base.body_orientation[c])
             carried = vec3(wp.quat_rotate(turned, wp.vec3d(chart.base.director[e])))
@@ -323,7 +323,7 @@ def _kernels(p: Precision, free: bool, lawful: bool) -> SimpleNamespace:
         # Out:
         chart: Chart,
     ):
-        """What the guards ask for: that a step is complete, and how far every motor has turned."""
+        """Sets what the guards read: that the step is complete, and how far every motor has turned."""
         k = wp.tid()
         first = model.first_node[k]
         c = model.cell_of[first]
@@ -348,7 +348,7 @@ def _kernels_of(model: DeviceModel) -> SimpleNamespace:
 
 
 def give_back(model: DeviceModel, state: DeviceState, chart: Any, work: Any, step: Any, noise: Any) -> None:
-    """Adds to the thermal velocities of a step what the last one took away from displacements to restore lengths.
+    """Takes the tensions back by which the last step restored lengths: adds their velocities to the thermal ones.
 
     Args:
         model, state: of the batch, at the start of the step.

@@ -1,12 +1,14 @@
 """Contacts of a step that is solved with the full mobility: the exact law at the gaps to which the whole step leads.
 
-Where a step begins, nearly parallel segments have their closest points anywhere, and thermal motion turns them by as
-much as a contact is wide: a force at the old points keeps other points no longer apart. So closest points, normals and
-gaps are found anew in the pose that the step leads to, and contact forces from there, on the increment without any.
+The closest points of nearly parallel segments lie anywhere along them, and thermal motion moves their ends by as much
+as a contact is wide: a force at the closest points of the step's start does not keep them apart at its end. So closest
+points, normals and gaps are found anew in the pose that the step leads to, and contact forces from these, beginning
+with the increment without any.
 
-The contact solve answers forces with P g M B, the matrix of the step for P. GMRES then solves with the full mobility,
-and the gaps move on, most where a contact is stiff over the step. So forces are found once more where that leads, on
-the increment less what they did, and GMRES solves for what their change does, in cells that have a contact.
+The contact solve has P g M B for the response to forces, with the matrix of the step for P. GMRES then solves with the
+full mobility, which changes the gaps, most where a contact is stiff over the step. So contact forces are found once
+more at the pose to which that leads, from the increment less the response to the first ones, and GMRES solves for the
+response to their change, in cells that have a contact.
 """
 
 import functools
@@ -67,7 +69,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
         contacts: Contacts,
         law: Law,
     ):
-        """From gaps where x leads to those that a linear step from the start has, and no force acts yet."""
+        """Takes the gaps at the pose to which x leads back to x = 0, linearly, and sets the contact forces to zero."""
         c = wp.tid()
         if state.active[c] == 0:
             return
@@ -128,7 +130,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
 
 def mark(model: DeviceModel, state: DeviceState, contacts: Any, law: Any, stability: Any, anew: bool) -> None:
-    """`strong` tells of cells with contact forces."""
+    """Sets `strong` in cells with contact forces; `anew`: whether it is cleared first."""
     kernels, device = _kernels(model.precision), model.device
     inputs = [model.data, state.data, contacts, law, anew, stability]
     wp.launch(kernels.mark, model.cell_count, inputs=inputs, device=device)
@@ -136,7 +138,7 @@ def mark(model: DeviceModel, state: DeviceState, contacts: Any, law: Any, stabil
 
 
 def renew(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: Any, contacts: Any, law: Any) -> None:
-    """Closest points, normals and gaps of the contacts where the increment x leads; the pose is left at the start."""
+    """Closest points, normals and gaps of the contacts at the pose to which the increment x leads; the pose stays."""
     kernels, device = _kernels(model.precision), model.device
     additive_chart.retract(model, state, chart, x, work)
     search.renew(model, state, state.data.pose, contacts)

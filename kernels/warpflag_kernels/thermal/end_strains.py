@@ -1,10 +1,10 @@
 """Strains of joints at the end of a step: what a linear step misses of them, and forces that set it right.
 
-A linear step means the strains w to become w + J x, with the gradients J where it began. Where x leads they are others:
-segments turn by the arctangent of what x turns them by, and rotations about several axes do not add up. That is of
-second order in x, but the same modes that a step leaves in equilibrium, as stiff ones are, carry it in every step:
-without more, bends of a helix of 6 um are 1 % too cold at 1e-5 s, those of a straight filament of 6 um 5 %. So the
-forces of a step are those of its end,
+A linear step takes the strains w to w + J x, with the gradients J at its start. At the pose to which x leads they
+differ from that: segments turn by the arctangent of what x turns them by, and rotations about several axes do not add
+up. That is of second order in x, but the same modes that a step leaves in equilibrium, as stiff ones are, carry it in
+every step: without more, bends of a helix of 6 um are 1 % too cold at 1e-5 s, those of a straight filament of 6 um 5 %.
+So the forces of a step are those of its end,
 
     x = x_linear - (1/dt + M H)^-1 M J^T k [w(q + x) - w - J x],
 
@@ -35,7 +35,7 @@ from warpflag_kernels.thermal import additive_chart, closing, strain_gradients
 
 # Each iteration leaves a share of the error about as large as the angle by which segments turn in the step. Of a helix
 # of 1.2 um at 1e-5 s one leaves bends 0.8 % too warm, two 0.03 %.
-ITERATIONS = 2
+STRAIN_ITERATIONS = 2
 
 
 @functools.cache
@@ -98,7 +98,7 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
         w -= one * strains.by_first_spin[i] + two * strains.by_second_spin[i]
         m = wp.cw_mul(joint_stiffness(model, i, k), w)
         if i == first:
-            m = vec3(zero, zero, m[2])  # the hook's bends are soft: a linear step will do
+            m = vec3(zero, zero, m[2])  # the hook's bends are soft: for them the linear step is exact enough
         state.joint_before[i] = wp.transpose(strains.by_first[i]) * m
         state.joint_after[i] = wp.transpose(strains.by_second[i]) * m
         state.joint_spin_before[i] = wp.dot(m, strains.by_first_spin[i])
@@ -113,7 +113,7 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
         # Out:
         y: Increment,
     ):
-        """Against the forces and torques; of the bodies: against the velocities that they cause."""
+        """Minus the forces and torques; of the bodies, minus the velocities that these cause."""
         e = wp.tid()
         c = model.cell_of[e]
         if state.active[c] == 0:
@@ -187,7 +187,7 @@ def correct(
         strains: struct `Strains`, of the start.
         band: struct `Band`, factorised.
         work: struct `Additive`.
-        room: two structs `Increment` to work in.
+        room: two structs `Increment`, room for intermediate results.
         x: struct `Increment`.
     """
     kernels, device, elements = _kernels_of(model), model.device, model.element_count
@@ -195,7 +195,7 @@ def correct(
     wp.copy(linear.node, x.node)
     wp.copy(linear.body, x.body)
     terms = linearised.linearised_terms(model)
-    for _ in range(ITERATIONS):
+    for _ in range(STRAIN_ITERATIONS):
         additive_chart.retract(model, state, chart, x, work)
         inputs = [model.data, chart, strains, x, state.data]
         wp.launch(kernels.missed, elements, inputs=inputs, device=device)

@@ -7,7 +7,7 @@ mode of rate lambda, z = lambda dt, is left with the variance kT/k times [2 z + 
 z^2] = 1: with v alone a step of backward Euler would freeze stiff modes to 1/(1 + z/2). What is not linear errs by O(kT
 dt), and motion that is driven by O(dt). Contacts obey the exact law at the end of the step, as in `collocation`.
 
-The step is fixed. One chosen by what the noise has done would prefer some noise to other.
+The step is fixed: one that depended on the noise drawn would prefer some realisations of it to others.
 """
 
 import functools
@@ -27,8 +27,8 @@ from warpflag_kernels.rod import chain_chart
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.stepping.health import Fault, encode
 
-IMPLICITNESS = 1.0  # implicitness: 1 damps what is driven, 1/2 would leave stiff modes ringing for ever
-# Of a gap [sigma]: thermal gaps of a closed contact vary by some 0.07 sigma.
+IMPLICITNESS = 1.0  # theta of the step: 1 damps driven modes most, 1/2 would leave stiff modes ringing for ever
+# Tolerance of a gap [sigma]: thermal gaps of a closed contact vary by some 0.07 sigma.
 GAP_TOLERANCE = 1.0e-4
 
 
@@ -164,7 +164,7 @@ def _contact_kernel(p: Precision) -> Any:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Contacts, Noise = contact_list.struct(p), noise_stage.struct(p)
-    normals, for_contact = random_numbers.functions(p).normals, wp.constant(random_numbers.CONTACT)
+    normals, for_contact = random_numbers.functions(p).normals, wp.constant(random_numbers.FOR_CONTACT)
     steric_law = steric.functions(p).steric_law
 
     @wp.kernel(module=p.module("contact_noise"))

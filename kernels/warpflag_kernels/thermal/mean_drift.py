@@ -38,6 +38,7 @@ from warpflag_kernels.fluid import lanczos_space
 from warpflag_kernels.fluid import noise as noise_stage
 
 CARRIED = ("force", "on_body", "velocity", "of_body")
+"""Arrays that carry over from one step to the next, and into checkpoints."""
 
 
 @functools.cache
@@ -75,7 +76,7 @@ def _kernels(p: Precision, pairs: bool, free: bool, shell: bool) -> SimpleNamesp
     normals, respond = random_numbers.functions(p).normals, body_stage.mobility(p).respond
     most, zero = wp.constant(lanczos_space.MOST_PRODUCTS), wp.constant(real(0.0))
     for_node, for_shift, for_turn = (
-        wp.constant(x) for x in (random_numbers.NODE, random_numbers.BODY_SHIFT, random_numbers.BODY_TURN)
+        wp.constant(x) for x in (random_numbers.FOR_NODE, random_numbers.FOR_BODY_SHIFT, random_numbers.FOR_BODY_TURN)
     )
     module = p.module("mean_drift", "pairs" * pairs + "free" * free + "_shell" * shell)
 
@@ -278,8 +279,8 @@ def remember(
         model, state: of the batch; forces of `state` are overwritten.
         control: struct `Control`.
         noise: struct `Noise`, drawn for this step.
-        lanczos: struct `Lanczos`, as it was left; without arrays where there is no pair sum.
-        shell: struct `Shell` in single precision that has the nodes in their places, or None.
+        lanczos: struct `Lanczos` after the draw of this step; without arrays where there is no pair sum.
+        shell: struct `Shell` in single precision that has the nodes' positions; None: that of the state is filled.
         drift: struct `Drift`.
     """
     kernels, device = _kernels_of(model), model.device

@@ -135,7 +135,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
     f = functions(p)
     joint_gradients, joint_stiffness, joined = f.joint_gradients, f.joint_stiffness, f.joined
     joint_strain = rotations.functions(p).joint_strain
-    normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.STRAIN)
+    normals, for_strain = random_numbers.functions(p).normals, wp.constant(random_numbers.FOR_STRAIN)
     module = p.module("strain_noise")
 
     @wp.kernel(module=module)
@@ -247,7 +247,7 @@ def _hook_kernels(p: Precision) -> SimpleNamespace:
     Stiffness, Noise = hessian.struct(p), noise_stage.struct(p)
     joint = hook.joint(p)
     helix_axis, hook_stiffness, axis_rates = joint.helix_axis, joint.stiffness, joint.axis_rates
-    normals, for_hook = random_numbers.functions(p).normals, wp.constant(random_numbers.HOOK)
+    normals, for_hook = random_numbers.functions(p).normals, wp.constant(random_numbers.FOR_HOOK)
     module = p.module("hook_noise")
 
     @wp.func(module=module)

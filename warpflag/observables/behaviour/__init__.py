@@ -1,4 +1,4 @@
-"""What is published of swimming cells: runs and tumbles, bundles and who is in them, flagella
+"""Measures of behaviour as they are published of swimming cells: runs and tumbles, bundles and their members, flagella
 wrapped round the body, wobble, motor loads.
 
 Functions of arrays, each tested on a construction; `warpflag.observables.behaviour.of_record` has them on the record of

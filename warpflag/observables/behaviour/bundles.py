@@ -12,11 +12,11 @@ from warpflag.observables.bundle import BUNDLE_DISTANCE, near_segments
 from warpflag.observables.phase import segment_tangents
 from warpflag.observables.shape import OUTER_PART, local_axes
 
-__all__ = ["ALONE", "SHARE", "bundle_axes", "bundle_counts", "bundle_membership"]
+__all__ = ["ALONE", "BESIDE_SHARE", "bundle_axes", "bundle_counts", "bundle_membership"]
 
 ALONE = -1
 """Stands for the bundle of a flagellum that is in none."""
-SHARE = 1 / 3
+BESIDE_SHARE = 1 / 3
 """Part of a flagellum's nodes that lie beside another one if the two are of one bundle: more than a crossing gives, and
 less than a finished bundle has, whose flagella come together at some distance from a wide body (three of 7.5 um: at
 half their length)."""
@@ -25,7 +25,7 @@ _PAIRS_AT_ONCE = 1 << 15  # of nodes and segments: temporary arrays that fit the
 
 
 def bundle_membership(
-    positions: ArrayLike, first_node: ArrayLike, distance: float = BUNDLE_DISTANCE, share: float = SHARE
+    positions: ArrayLike, first_node: ArrayLike, distance: float = BUNDLE_DISTANCE, share: float = BESIDE_SHARE
 ) -> NDArray[np.int64]:
     """The bundle of every flagellum, shape [frame_count, flagellum_count]; -1 for one that is alone.
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from warpflag.observables.arrays import Array, elapsed
 
 __all__ = [
-    "REACH",
+    "DIRECTION_TIME",
     "SHORTEST_RUN",
     "SHORTEST_TUMBLE",
     "SLOW",
@@ -34,7 +34,7 @@ SHORTEST_RUN = 0.05
 """A run shorter than this between two tumbles is part of one tumble [s]."""
 SHORTEST_TUMBLE = 0.02
 """A tumble shorter than this is part of a run [s]."""
-REACH = 0.1
+DIRECTION_TIME = 0.1
 """Time of a run next to a tumble that gives the run's direction there [s]."""
 
 
@@ -140,7 +140,7 @@ def runs_and_tumbles(
     turning: float = TURNING,
     shortest_run: float = SHORTEST_RUN,
     shortest_tumble: float = SHORTEST_TUMBLE,
-    reach: float = REACH,
+    reach: float = DIRECTION_TIME,
 ) -> RunsAndTumbles:
     """Cuts a path into runs and tumbles: a cell tumbles where it is slow, or where its direction turns fast.
 

@@ -18,7 +18,7 @@ __all__ = ["EFFECTS", "left_out"]
 _THERMAL = 4.11e-3  # kT at 298 K [pN um]
 _DENSITY = 1.0e-9  # of water [pN s^2/um^4]
 _HOOK_LENGTH, _HOOK_STIFFNESS = 0.055, 0.65  # of a real hook, relaxed [um, pN um/rad]
-_FREE_END = 4.0  # squared displacement of a free end over that of the middle of a long rod
+_FREE_END_FACTOR = 4.0  # squared displacement of a free end over that of the middle of a long rod
 _FREE_MODE = 1.8751  # slowest bending mode of a rod held at one end: first root of cos q cosh q = -1
 
 
@@ -48,7 +48,7 @@ def thermal_noise(scene: Scene, stiff: Turning) -> str | None:
     growth = (a * scene.duration / drag) ** 0.75
     middle = 2 * _THERMAL * math.gamma(0.25) / (3 * math.pi * a) * growth
     rest = _THERMAL * stiff.axial_length**2 * spec.length / (3 * a)
-    size = math.sqrt(2 * min(_FREE_END * middle, rest))
+    size = math.sqrt(2 * min(_FREE_END_FACTOR * middle, rest))
     return f"thermal noise: would move the tips by about {size:.2g} um (rms) in {1e3 * scene.duration:.3g} ms"
 
 

@@ -77,7 +77,8 @@ def _mobility(scene: Scene, spec: FlagellumSpec, x: Array) -> Array:
 
 
 def mesh_dependence(scene: Scene, finer: float) -> float | None:
-    """Rate of the stiff flagellum on the scene's mesh over that on one `finer` times as long, less 1; None: no such."""
+    """Relative change of the stiff flagellum's rate from segments `finer` times as long to the scene's; None: not
+    allowed."""
     try:
         h = max(spec.segment_length for spec in scene.resolved_flagella())
         return turning(scene).rate / turning(scene, finer * h).rate - 1.0

@@ -19,8 +19,10 @@ _FRAMES_OBSERVED = 8  # frames whose observables are timed at once, as a run mea
 _COLD = 6.0  # s of preparing, above which kernels have been compiled: with a warm cache it takes one
 _PER_FRAME = 1.5e-4  # s for the record of a frame; measured on zipping.toml
 _MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame; measured on zipping.toml
-# Contacts ask for more and dearer steps: stepping of whole runs over what the first steps say (docs/tradeoff.md).
-_LEAST, _FEW, _TOUCHING, _PER_FLAGELLUM, _CROWD = 0.8, 1.4, 1.8, 0.45, 8
+# Contacts ask for more and dearer steps. Time of stepping a whole run over what its first steps say, measured
+# (docs/tradeoff.md): at least, and at most with up to three flagella; with more that touch already.
+_LEAST_FACTOR, _FEW_FACTOR, _TOUCHING_FACTOR = 0.8, 1.4, 1.8
+_SLOPE, _LARGEST_CROWD = 0.45, 8  # with n flagella that do not touch yet: 1 + _SLOPE (n - 2), n up to _LARGEST_CROWD
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,17 @@ class Needed:
 
     @property
     def stepping(self) -> float:
+        """All of stepping [s], without contacts that form later."""
         return self.sampled + self.rest
 
     @property
     def least(self) -> float:
-        return self.startup + self.sampled + _LEAST * self.rest + self.output
+        """Lower end of the range of the run's time [s]."""
+        return self.startup + self.sampled + _LEAST_FACTOR * self.rest + self.output
 
     @property
     def most(self) -> float:
+        """Upper end of that range [s]."""
         return self.startup + self.sampled + self.crowd * self.rest + self.output
 
 
@@ -70,10 +75,11 @@ def needed(simulation: Simulation) -> Needed:
     nodes = int(simulation.first_node[-1])
     output = scene.frames * (_observing(simulation) + _PER_FRAME + _MOVIE_PER_NODE * nodes) + _MOVIE
     count = len(scene.resolved_flagella())
-    crowd = _FEW if count < 4 or not scene.steric.enabled else 1 + _PER_FLAGELLUM * (min(count, _CROWD) - 2)
+    few = count < 4
+    crowd = _FEW_FACTOR if few or not scene.steric.enabled else 1 + _SLOPE * (min(count, _LARGEST_CROWD) - 2)
     spent, rest = _stepping(simulation)
     if simulation.cell_state().steric_force > 0.0:
-        crowd = _FEW if count < 4 else _TOUCHING  # as they do already
+        crowd = _FEW_FACTOR if few else _TOUCHING_FACTOR
     return Needed(startup - compiling, compiling, spent, rest, output, crowd)
 
 

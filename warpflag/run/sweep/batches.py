@@ -15,7 +15,7 @@ from warpflag.scene import Scene
 
 __all__ = ["Batch", "cut", "groups", "share"]
 
-_GOLDEN = (5.0**0.5 - 1.0) / 2.0  # golden ratio: its multiples modulo 1 lie most evenly
+_GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0  # golden ratio: its multiples modulo 1 lie most evenly
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def cut(group: Sequence[int], size: int) -> list[list[int]]:
     count = math.ceil(len(group) / size)
     if size == 1:
         return [[k] for k in group]
-    order = sorted(range(len(group)), key=lambda i: i * _GOLDEN % 1.0)
+    order = sorted(range(len(group)), key=lambda i: i * _GOLDEN_RATIO % 1.0)
     ends = [len(group) * k // count for k in range(count + 1)]
     return [sorted(group[i] for i in order[first:last]) for first, last in itertools.pairwise(ends)]
 

@@ -21,9 +21,9 @@ from warpflag.scene.reading import check_key
 __all__ = ["Draws"]
 
 _TRIES = 2000  # places drawn for an anchor before the sweep is refused: one in 500 that are free is missed at 2 %
-_PER_FLAGELLUM = "flagellum."
+_FLAGELLUM_PREFIX = "flagellum."
 _ANCHOR_KEYS = ("placement", "least_distance", "from", "to", "clearance", "given")
-_GOLDEN_ANGLE = 180.0 * (3.0 - math.sqrt(5.0))  # deg; successive points of an even spiral
+_GOLDEN_DEGREES = 180.0 * (3.0 - math.sqrt(5.0))  # deg; successive points of an even spiral
 
 
 class Draws:
@@ -53,7 +53,7 @@ class Draws:
     def differs_in_repeats(self) -> bool:
         """Whether the repeats of a point differ."""
         placed = self._anchors is not None and self._anchors["placement"] == "random"
-        return placed or any(key.startswith(_PER_FLAGELLUM) for key in self._values)
+        return placed or any(key.startswith(_FLAGELLUM_PREFIX) for key in self._values)
 
     def values(self, scene: Scene, draw: int, repeat: int) -> dict[str, Any]:
         """The random values of one member by dotted key.
@@ -68,8 +68,8 @@ class Draws:
         """
         count, values = scene.flagella.count, {}
         for key, spread in self._values.items():
-            if key.startswith(_PER_FLAGELLUM):
-                name = key[len(_PER_FLAGELLUM) :]
+            if key.startswith(_FLAGELLUM_PREFIX):
+                name = key[len(_FLAGELLUM_PREFIX) :]
                 drawn = _drawn(spread, self._stream(key, draw, repeat), count)
                 values |= {f"flagellum.{k}.{name}": float(value) for k, value in enumerate(drawn)}
             else:
@@ -101,7 +101,7 @@ class Draws:
         low, high = table.get("from", -cylinder), table.get("to", cylinder)
         if table["placement"] == "even":
             offsets = low + (high - low) * (np.arange(count) + 0.5) / count
-            return [(float(k * _GOLDEN_ANGLE % 360.0), float(offset)) for k, offset in enumerate(offsets)]
+            return [(float(k * _GOLDEN_DEGREES % 360.0), float(offset)) for k, offset in enumerate(offsets)]
         return _random_anchors(scene, table, low, high, self._stream("anchors", draw, repeat))
 
 
@@ -165,16 +165,16 @@ def _drawn(spread: Mapping[str, float], stream: np.random.Generator, count: int)
 
 def _check_varied(key: str, spread: Any) -> None:
     """That scenes have the key of a spread."""
-    own = key.startswith(_PER_FLAGELLUM)
-    name = key[len(_PER_FLAGELLUM) :] if own else key
+    own = key.startswith(_FLAGELLUM_PREFIX)
+    name = key[len(_FLAGELLUM_PREFIX) :] if own else key
     if own and name[:1].isdigit():
-        problem = f"is drawn for every flagellum by itself: write {_PER_FLAGELLUM}{name.partition('.')[2]}"
+        problem = f"is drawn for every flagellum by itself: write {_FLAGELLUM_PREFIX}{name.partition('.')[2]}"
         raise SceneError(f"random.{key}", spread, problem)
     try:
-        check_key(f"{_PER_FLAGELLUM}0.{name}" if own else key, spread)
+        check_key(f"{_FLAGELLUM_PREFIX}0.{name}" if own else key, spread)
     except SceneError as error:
         raise SceneError(
-            f"random.{key}", spread, error.problem.replace(f"{_PER_FLAGELLUM}0.", _PER_FLAGELLUM)
+            f"random.{key}", spread, error.problem.replace(f"{_FLAGELLUM_PREFIX}0.", _FLAGELLUM_PREFIX)
         ) from None
 
 

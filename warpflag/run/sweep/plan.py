@@ -41,7 +41,7 @@ from warpflag.scene.scene_file import nearest, read_overrides, read_toml
 __all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_axes", "read"]
 
 BASE_NAME = "base.toml"
-_KEYS = ("base", "name", "repeats", "set", "axes", "random")
+_SWEEP_KEYS = ("base", "name", "repeats", "set", "axes", "random")
 _MOST_MEMBERS = 1_000_000  # of a sweep: more is a slip in its axes, and their scenes would take gigabytes
 _OUTER_COMMA = re.compile(r",(?![^\[]*\])")  # one that is not within brackets
 
@@ -219,9 +219,9 @@ def read(path: str | Path, overrides: Sequence[str] = (), grid: Sequence[str] = 
 
 
 def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes: Mapping[str, list[Any]]) -> Sweep:
-    for key in table.keys() - set(_KEYS):
-        near = nearest(key, _KEYS)
-        hint = f"did you mean {near}?" if near else "known here: " + ", ".join(_KEYS)
+    for key in table.keys() - set(_SWEEP_KEYS):
+        near = nearest(key, _SWEEP_KEYS)
+        hint = f"did you mean {near}?" if near else "known here: " + ", ".join(_SWEEP_KEYS)
         raise SceneError(key, table[key], f"unknown key; {hint}")
     base = table.get("base")
     if not isinstance(base, str):

@@ -16,8 +16,8 @@ from warpflag.run.run_directory import SCENE_NAME, summary_of
 __all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "write"]
 
 TABLE_NAME, MEANS_NAME, HDF5_NAME = "table.csv", "means.csv", "table.h5"
-# Of a summary; what the machine took for it is no result.
-_NUMBERS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events", "behaviour")
+# Entries of a summary that the table takes; what the machine took for them is no result.
+_RESULTS = ("time", "frames", "steps", "rejected_steps", "evaluations", "observables", "rates", "events", "behaviour")
 
 
 def status_of(directory: Path) -> str:
@@ -50,7 +50,7 @@ def _row(member: Any, directory: Path) -> dict[str, Any]:
     summary = summary_of(directory)
     row: dict[str, Any] = {"member": member.number, "point": member.point, "repeat": member.repeat, **member.values}
     row["status"] = status_of(directory)
-    return row | _flat({name: summary[name] for name in _NUMBERS if name in summary})
+    return row | _flat({name: summary[name] for name in _RESULTS if name in summary})
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -14,7 +14,7 @@ SOURCES = ("time step", "precision", "mesh", "model", "execution")
 """What an error comes from, in the order of the report."""
 _ACCURACIES = (5e-2, 2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 1e-4)  # um per ms, of the implicit stepper
 _RKC_ACCURACIES = (5e-2, 5e-3)  # as draft and standard; finer ones take minutes
-_STEPS = (2e-5, 1e-5)  # fixed steps [s]: near those that step control takes
+_FIXED_STEPS = (2e-5, 1e-5)  # fixed steps [s]: near those that step control takes
 _RELATIVE_COST = {"rkc": 10.0}  # of a stepper, roughly: zipping.toml takes nine times as long
 _COST_POWER = 0.4  # cost goes as accuracy to the minus this: errors of steps as dt^2.5
 _MESHES = (2.0, 1.5, 0.75, 0.5)  # segment lengths over the scene's: to either side by a factor of two
@@ -102,7 +102,7 @@ def choices_of(scene: Scene, devices: list[str]) -> list[Choice]:
         if m != scene.hydrodynamics.mode
     ]
     found += _switched(scene, standard)
-    found += [Choice(f"step {s:g}", "time step", {**_EXACT, "numerics.time_step": s}, turn=3) for s in _STEPS]
+    found += [Choice(f"step {s:g}", "time step", {**_EXACT, "numerics.time_step": s}, turn=3) for s in _FIXED_STEPS]
     found += [
         Choice(f"rkc {a:g}", "time step", {**_EXACT, "numerics.stepper": "rkc", "numerics.accuracy": a}, turn=4)
         for a in _RKC_ACCURACIES

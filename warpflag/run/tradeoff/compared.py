@@ -1,4 +1,4 @@
-"""Points beside their references: errors by source, the Pareto front, and settings to recommend."""
+"""Points compared with their references: errors by source, the Pareto front, and settings to recommend."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpflag.run.tradeoff.points import MEASURES, Point
-from warpflag.scene.sections import ACCURACY_LEVELS
+from warpflag.scene.run_sections import ACCURACY_LEVELS
 
 __all__ = ["LEVELS", "Row", "Summary", "compared", "front", "recommended", "summaries"]
 
@@ -57,7 +57,7 @@ class Summary:
 
 
 def compared(points: Sequence[Point]) -> list[Row]:
-    """All points of windows that have a reference, beside it."""
+    """A row for every point of a window that has a reference."""
     rows = []
     for window in dict.fromkeys(point.window for point in points):
         own = [point for point in points if point.window == window]

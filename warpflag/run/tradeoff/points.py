@@ -24,8 +24,8 @@ __all__ = ["MEASURES", "Point", "load", "measured", "save"]
 MEASURES = ("theta", "l_r", "f_c", "motor_rate", "body_rate", "speed")
 """What is compared beside node positions: means over the second half of a window."""
 _OF_FRAMES = ("phase_difference", "bundle_length", "steric_force_density", "motor_rate", "body_rate", "body_speed")
-_FRAMES = 40  # of a window: means over its second half have twenty
-_SHORT = 0.5  # s of computing: below, the cost is the least of two runs
+_WINDOW_FRAMES = 40  # of a window: means over its second half have twenty
+_SHORT_RUN = 0.5  # s of computing: below, the cost is the least of two runs
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def measured(
     Raises:
         SceneError: the scene can't be run in this way from this shape.
     """
-    own = with_values(choice.scene(scene), {"duration": course.length, "frames": _FRAMES, "start.record": None})
+    own = with_values(choice.scene(scene), {"duration": course.length, "frames": _WINDOW_FRAMES, "start.record": None})
     start = on_mesh(window.shape, own)
     cost = np.inf
     while True:
@@ -86,7 +86,7 @@ def measured(
         taken = time.process_time() - began
         repeated = np.isfinite(cost)
         cost = min(cost, taken)
-        if repeated or taken > _SHORT or status != "done":
+        if repeated or taken > _SHORT_RUN or status != "done":
             break
     half = frames[len(frames) // 2 :]
     measures = {

@@ -17,7 +17,7 @@ __all__ = ["CSV_NAME", "text", "write_csv"]
 
 CSV_NAME = "tradeoff.csv"
 _UNITS = {"f_c": "pN/um", "motor_rate": "Hz", "body_rate": "Hz", "speed": "um/s"}
-_DEFAULT = "accuracy 0.005"
+_STANDARD = "accuracy 0.005"
 
 
 def write_csv(rows: Sequence[Row], course: Course, path: Path) -> None:
@@ -35,7 +35,7 @@ def write_csv(rows: Sequence[Row], course: Course, path: Path) -> None:
 
 
 def text(rows: Sequence[Row], found: Sequence[Summary], course: Course) -> str:
-    """The report."""
+    """The report of a study: costs, errors by source, lengths of runs, settings to paste."""
     windows = ", ".join(f"{window.name} from {1e3 * window.time:.3g} ms" for window in course.windows)
     lines = [f"windows of {1e3 * course.length:.3g} ms: {windows}", ""]
     lines += _costs(found, course)
@@ -76,7 +76,7 @@ def _sources(rows: Sequence[Row]) -> list[str]:
         f"{'source':30}" + "".join(f"{name:>12}" for name in MEASURES),
         "-" * 102,
     ]
-    shown = [("time step at 5e-3", [r for r in rows if r.point.choice == _DEFAULT])]
+    shown = [("time step at 5e-3", [r for r in rows if r.point.choice == _STANDARD])]
     shown += [("mesh of the scene", [r for r in rows if r.point.choice == "reference"])]
     others = dict.fromkeys(r.point.choice for r in rows if r.point.source in ("precision", "mesh", "model"))
     shown += [(name, [r for r in rows if r.point.choice == name]) for name in others]

@@ -25,7 +25,7 @@ _BEFORE_ZIP = 0.3  # of a window's length before the first zip
 # How the coarse run is stepped: at a fifth of the default's accuracy, which places a window well enough.
 _COARSE = {"numerics.accuracy": 2e-2, "numerics.time_step": None, "numerics.stepper": "implicit"}
 _LENGTH = 1e-3  # s, what an accuracy refers to
-_FRAMES = 400  # of the coarse run: a window's beginning is found to a part in four hundred
+_COURSE_FRAMES = 400  # of the coarse run: a window's beginning is found to a part in four hundred
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ def found_by_run(scene: Scene, device: str | None, late: Callable[[], bool], tol
         NumericalError: a guard is violated before any frame.
         SceneError: the scene can't be simulated.
     """
-    coarse = with_values(scene, {**_COARSE, "frames": _FRAMES})
+    coarse = with_values(scene, {**_COARSE, "frames": _COURSE_FRAMES})
     simulation = Simulation(coarse, device=device)
     frames: list[Frame] = []
     for block in simulation.frame_blocks():
         frames += [rows.frame(k) for found in block for rows in found.values() for k in range(len(rows))]
-        told(len(frames) / (_FRAMES + 1))
+        told(len(frames) / (_COURSE_FRAMES + 1))
         if late() and len(frames) > 1:
             break
     return _course(scene, frames, simulation.first_node)

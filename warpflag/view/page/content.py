@@ -28,7 +28,7 @@ from warpflag.view.usd.cell import SPOKE_COLORS, SPOKE_LENGTHS, SPOKE_WIDTH
 __all__ = ["content"]
 
 _UNDEFINED = 255  # colour number of a value that is not defined; the others are 0 to 254
-_STEPS = 65535  # of a coordinate in 16 bits
+_COORDINATE_STEPS = 65535  # of a coordinate in 16 bits
 _BYTES_PER_NODE = 9  # three coordinates and three quantities
 
 
@@ -48,7 +48,7 @@ def content(record: Record, color_by: str, follow: bool, most_bytes: int | None)
     centres = record.body_position[frames]
     relative = positions - centres[:, None]
     low, high = relative.min(axis=(0, 1)), relative.max(axis=(0, 1))
-    step = np.where(high > low, (high - low) / _STEPS, 1.0)
+    step = np.where(high > low, (high - low) / _COORDINATE_STEPS, 1.0)
     anchors, tripods = motors(record, scene)
     path = steady_path(centres)
     return {

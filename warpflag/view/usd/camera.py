@@ -18,8 +18,8 @@ __all__ = ["Extent", "add_camera", "add_lights", "arranged", "steady_path", "vie
 Array = NDArray[np.float64]
 
 _FOCAL_LENGTH = 60.0  # in tenths of a scene unit as the apertures; only their ratio counts
-_WIDEST = 16 / 9  # width over height of a picture: that of screens and films
-_TANGENTS = np.array([0.3, 0.3 / _WIDEST])  # of half the angles of view across and up
+_ASPECT = 16 / 9  # width over height of a picture: that of screens and films
+_TANGENTS = np.array([0.3, 0.3 / _ASPECT])  # of half the angles of view across and up
 _FRAMING_MARGIN = 1.06  # distance of the camera over that at which all just fits in: 3 % free on each side
 # Weights of (x, y, z) in the reach to right, left, up, down, front and back, see `Extent`.
 _SIDES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
@@ -106,7 +106,7 @@ def arranged(reaches: Sequence[Array]) -> tuple[Array, Array]:
     right, left, up, down, *_ = sides = np.stack(reaches, axis=1)
     middles = np.stack([right - left, up - down, np.zeros(count)], axis=1) / 2
     width, height = 1.05 * (right + left).max(), 1.05 * (up + down).max()
-    columns = min(range(1, count + 1), key=lambda n: max(n * width, -(-count // n) * height * _WIDEST))
+    columns = min(range(1, count + 1), key=lambda n: max(n * width, -(-count // n) * height * _ASPECT))
     row, column = np.divmod(np.arange(count), columns)
     shifts = np.stack([column * width, -row * height, np.zeros(count)], axis=1) - middles
     return shifts, (sides + _SIDES @ shifts.T).max(axis=1)

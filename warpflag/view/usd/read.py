@@ -19,8 +19,8 @@ __all__ = ["Camera", "Film", "Rods", "opened"]
 
 Array = NDArray[np.float64]
 
-_PIECES = 4  # straight pieces per span of a cubic curve
-_T = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]  # places along a span, its ends and between pieces
+_PIECES_PER_SPAN = 4  # straight pieces per span of a cubic curve
+_T = np.linspace(0.0, 1.0, _PIECES_PER_SPAN + 1)[:, None]  # places along a span, its ends and between pieces
 # Catmull-Rom weights of the four points about a span, at these places; a linear curve has one piece.
 _CUBIC = 0.5 * np.hstack(
     [-_T + 2 * _T**2 - _T**3, 2 - 5 * _T**2 + 3 * _T**3, _T + 4 * _T**2 - 3 * _T**3, -(_T**2) + _T**3]

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 SIDES = 8
 """Sides of a tube."""
-_PIECES = 2  # straight pieces of a tube per segment
+_PIECES_PER_SEGMENT = 2  # straight pieces of a tube per segment
 # Rings of a round end, from its pole: radius, and distance from the end of the axis, in radii of the tube.
 _CAP = np.array([[0.05, 1.0], [0.7, 0.7]])
 
@@ -45,8 +45,8 @@ def tube(points: Array, radius: float) -> tuple[Array, Array]:
 
 def node_of_vertex(point_count: int) -> NDArray[np.integer]:
     """The point that is nearest to each vertex of a tube, shape [ring * SIDES]."""
-    along = np.arange((point_count - 1) * _PIECES + 1)
-    nearest = np.pad((along + _PIECES // 2) // _PIECES, len(_CAP), mode="edge")
+    along = np.arange((point_count - 1) * _PIECES_PER_SEGMENT + 1)
+    nearest = np.pad((along + _PIECES_PER_SEGMENT // 2) // _PIECES_PER_SEGMENT, len(_CAP), mode="edge")
     return np.repeat(nearest, SIDES)
 
 
@@ -90,7 +90,7 @@ def _curve(points: Array) -> Array:
     before, after = 2.0 * points[:, :1] - points[:, 1:2], 2.0 * points[:, -1:] - points[:, -2:-1]
     p = np.concatenate([before, points, after], axis=1)
     p0, p1, p2, p3 = p[:, :-3, None], p[:, 1:-2, None], p[:, 2:-1, None], p[:, 3:, None]
-    t = (np.arange(_PIECES) / _PIECES)[:, None]
+    t = (np.arange(_PIECES_PER_SEGMENT) / _PIECES_PER_SEGMENT)[:, None]
     spans = 0.5 * (
         2.0 * p1 + (p2 - p0) * t + (2.0 * p0 - 5.0 * p1 + 4.0 * p2 - p3) * t**2 + (3.0 * (p1 - p2) + p3 - p0) * t**3
     )
