@@ -385,7 +385,7 @@ def test_a_file_without_a_format_has_the_paper_s_model_and_says_so_once(tmp_path
     [
         ("motor", 5),
         ("motor", sections.Hook()),
-        ("external", sections.Start()),
+        ("external", Start()),
         ("flagellum", "ab"),
         ("flagellum", None),
         ("flagellum", (1,)),
