@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import threading
 import time
@@ -90,6 +91,13 @@ def test_a_process_outlives_its_starter_and_the_starter_no_signal_but_its_end(st
     assert ask(other, "still").startswith("still")
     other.stdin.close()
     assert soon(other.stdout.read) == "" and other.wait() == 1  # nobody knows any more
+
+
+def test_it_ends_in_order_when_who_asked_is_killed_before_it_took_the_answer(starter):
+    starter.begin("early")
+    assert select.select([starter.connection], [], [], 30.0)[0]
+    starter.connection.close()  # as the end of the process does
+    assert starter.process.wait(30.0) == 0
 
 
 def test_a_starter_that_ended_is_an_error_of_the_machine(starter):

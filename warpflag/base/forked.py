@@ -169,12 +169,15 @@ def _serve(module: Any) -> None:
     """Answers requests on the standard input, a socket, until it is closed; returns in the processes forked."""
     own = socket.socket(fileno=os.dup(0))
     while True:
-        size, files, _, _ = socket.recv_fds(own, _LENGTH_DIGITS, 2)
+        try:
+            size, files, _, _ = socket.recv_fds(own, _LENGTH_DIGITS, 2)
+            content = b""
+            while size and len(content) < int(size):
+                content += own.recv(int(size) - len(content)) or os._exit(0)
+        except ConnectionResetError:  # the process that asks was killed before it took an answer
+            os._exit(0)
         if not size:
             os._exit(0)
-        content = b""
-        while len(content) < int(size):
-            content += own.recv(int(size) - len(content)) or os._exit(0)
         request = json.loads(content)
         answer: Any = None
         if "prepare" in request:

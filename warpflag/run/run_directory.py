@@ -195,8 +195,9 @@ def check_same_scene(directory: Path, scene: Scene) -> None:
     Raises:
         RunError: it is another one, and in which setting.
     """
+    recorded = (directory / SCENE_NAME).read_bytes()
     text = dumps(scene)
-    if (directory / SCENE_NAME).read_bytes() == text.encode():
+    if recorded == text.encode():
         return
     there = load(directory / SCENE_NAME)
     if dumps(there) != text:

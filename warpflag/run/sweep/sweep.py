@@ -33,7 +33,8 @@ FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
 _LARGEST_BATCH = {"cpu": 64, "cuda": 512}  # members: what a worker that dies begins again; a GPU needs many to be full
 _SAMPLE_CELLS = 8  # members that are timed
-_SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run
+_SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run, at least
+_TABLE_SHARE = 0.02  # of the time at most goes into them: those of ten thousand members take a second
 _SECONDS_FOR_LOCKS = 10.0  # for which members of a sweep that was killed may still be held by its workers
 
 
@@ -156,7 +157,7 @@ class SweepRun:
         count = min(workers or (len(devices) if devices != ["cpu"] else cores()), len(pending))
         progress = Progress(sum(self.members[k].scene.duration for k in pending), quiet=quiet)
         failed: dict[int, str] = {}
-        written = monotonic()
+        next_table = monotonic() + _SECONDS_PER_TABLE
         ended: Ended | None = None
         with Pool([devices[k % len(devices)] for k in range(count)], options, starter) as pool:
             try:
@@ -176,9 +177,9 @@ class SweepRun:
                                 if not quiet:
                                     tell(f"{self.names[k]}: {outcome.message}")
                     progress.update(pool.reached)
-                    if monotonic() - written > _SECONDS_PER_TABLE:
+                    if (now := monotonic()) > next_table:
                         self._write_table()
-                        written = monotonic()
+                        next_table = monotonic() + max(_SECONDS_PER_TABLE, (monotonic() - now) / _TABLE_SHARE)
                     stop.check()
             except KeyboardInterrupt as error:
                 ended = error if isinstance(error, Ended) else Ended("interrupted", "")
