@@ -220,6 +220,26 @@ def test_opposite_contacts_cancel_in_the_net_rule_only():
     assert values["nodes"] == pytest.approx(one)
 
 
+@pytest.mark.parametrize(("rule", "share"), [("pairs", 2.0), ("nodes", 2 / 3), ("net", 2 / 3)])
+def test_a_line_between_two_is_pressed_by_none(rule, share):
+    """Three lines in a row, crossing pairs only at the middle ones: forces on the middle line cancel."""
+    apart, along = np.array([0.0, 0.038, 0.0]), line(2, h=2.0) - [0.0, 0.0, 1.0]
+    across = along[:, [2, 1, 0]]
+    shape = joined(across - apart, along, across + apart)
+    found = observables.steric_force_density(*shape, **LAW, rule=rule)
+    assert found == pytest.approx(share * force_at(0.038) / 6.0)
+
+
+def test_neighbours_of_a_flagellum_with_long_segments_do_not_touch():
+    """Segments longer than 3 sigma: the next one shares a node and counts for nothing, the one after it does."""
+    straight = line(6, h=0.2)
+    alone = (straight, np.array([0, 6]))
+    assert observables.steric_force_density(*alone, **LAW, self_contact=True) == 0.0
+    hairpin = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.2], [0.0, 0.038, 0.2], [0.0, 0.038, 0.0]])
+    found = observables.steric_force_density(hairpin, np.array([0, 4]), **LAW, self_contact=True)
+    assert found == pytest.approx(force_at(0.038) / 6.0)
+
+
 def test_apart_there_is_no_force():
     shape = joined(line(11), line(11, x=0.045))
     assert observables.steric_force_density(*shape, **LAW) == 0.0

@@ -20,7 +20,7 @@ from warpflag.record import Record, RecordError
 from warpflag.run import member, run
 from warpflag.run.checkpoint import CheckpointError
 from warpflag.run.run_directory import RunError
-from warpflag.run.stop import Stop, wall_seconds
+from warpflag.run.stop import Ended, Stop, wall_seconds
 from warpflag.run.sweep.table import status_of
 from warpflag.scene import SceneError, dumps, load
 
@@ -78,6 +78,17 @@ def test_signals_that_terminate_leave_a_resumable_run(number, tmp_path):
     assert summary(halved)["status"] == "terminated"
     assert run.resume(str(halved)).execute(quiet=True).status == "done"
     assert_same_frames(whole, halved)
+
+
+def test_a_second_ctrl_c_ends_a_process_wherever_it_is():
+    with Stop() as stop:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)  # waits for `check`, as the first did
+        with pytest.raises(Ended):
+            stop.check()
+        with pytest.raises(Ended) as ended:
+            signal.raise_signal(signal.SIGINT)
+    assert ended.value.status == "interrupted"
 
 
 def test_the_wall_time_ends_a_run(tmp_path):

@@ -44,6 +44,12 @@ def test_members_are_cut_to_fit_the_wall_time(started, monkeypatch):
     assert slurm.Jobs(started, 3600.0, count=9).jobs() == 3  # never more than members
 
 
+@pytest.mark.parametrize(("seconds", "notice"), [(60.0, 10), (600.0, 60), (1800.0, 120), (86400.0, 120)])
+def test_a_job_is_told_to_end_a_tenth_of_its_time_before(started, seconds, notice):
+    """At least ten seconds, in which a batch ends in order, and at most two minutes."""
+    assert f"#SBATCH --signal=B:USR1@{notice}\n" in slurm.Jobs(started, seconds, count=1).script()
+
+
 @pytest.mark.parametrize(
     "seconds, text", [(60, "00:01:00"), (61, "00:02:00"), (5400, "01:30:00"), (86400, "1-00:00:00"), (1, "00:01:00")]
 )

@@ -74,6 +74,34 @@ def test_nonsense_is_refused_before_anything_is_made(tmp_path, capsys):
     assert "motor.torque" in capsys.readouterr().err and not (tmp_path / "made").exists()
 
 
+def test_a_mesh_that_was_stopped_is_no_reference():
+    """Meshes are compared with the finest one that came to its end."""
+
+    def point(choice: str, source: str, status: str, nodes: int, speed: float) -> points.Point:
+        measures = dict.fromkeys(points.MEASURES, speed)
+        return points.Point("start", choice, source, status, 1.0, 10, measures, {}, np.zeros((2, nodes, 3)))
+
+    given = [point("reference", "time step", "done", 22, 1.0), point("h 0.1", "mesh", "done", 42, 2.0)]
+    given += [point("h 0.05", "mesh", "stopped", 82, 30.0), point("h 0.4", "mesh", "done", 12, 0.5)]
+    off = {row.point.choice: row.off["speed"] for row in compared.compared(given)}
+    assert off == {"reference": -1.0, "h 0.1": 0.0, "h 0.05": 28.0, "h 0.4": -1.5}
+
+
+def test_costs_are_guessed_by_steps_and_segments():
+    """Half the segment length: twice the nodes and, at the same accuracy, twice the steps or more."""
+    scene = small()
+
+    def cost(**values: object) -> float:
+        own = {"numerics.stepper": "implicit"} | {key.replace("__", "."): value for key, value in values.items()}
+        return choices.relative_cost(choices.Choice("any", "mesh", own), scene)
+
+    assert cost() == 1.0 and cost(flagella__segment_length=scene.flagella.segment_length) == 1.0
+    assert cost(flagella__segment_length=0.5 * scene.flagella.segment_length) == pytest.approx(4.0)
+    assert cost(flagella__segment_length=2.0 * scene.flagella.segment_length) == pytest.approx(0.25)
+    assert cost(numerics__accuracy=5e-4) > 1.5 and cost(numerics__accuracy=5e-2) < 0.7
+    assert cost(numerics__stepper="rkc") > 2.0
+
+
 def test_a_shape_on_another_mesh_is_the_same_curve():
     coarse = small({"flagella.length": 6.0, "flagella.segment_length": 0.2})
     fine = with_values(coarse, {"flagella.segment_length": 0.05})

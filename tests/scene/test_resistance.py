@@ -14,7 +14,8 @@ import pytest
 from tests.helpers import attachment, cell, ground_state_frames, helix_axis, placed
 from tests.oracles import device_mobility
 from warpflag.run.simulation import Simulation
-from warpflag.scene.resistance import spheroid_mobility
+from warpflag.scene import paper_scene, with_values
+from warpflag.scene.resistance import pace, spheroid_mobility
 
 # Relative to resistive-force theory and to the numbers quoted below, which have three or four digits.
 TOLERANCE = {"float64": 5e-3, "float32": 5e-3}
@@ -146,3 +147,17 @@ def test_consistent_mode_converges_to_slender_body_theory(device):
         for count in (45, 180)
     ]
     assert printed[1] < 0.9 * printed[0]
+
+
+def test_pace_is_that_of_the_easiest_motion():
+    """With drags kept as in water, a thin fluid still lets flows and the body be as fast as it says."""
+    printed = {"fluid.drag_parallel": 1.6e-3, "fluid.drag_perpendicular": 2.8e-3, "fluid.drag_rotation": 1.26e-6}
+    for values, expected in (
+        ({}, 1.0),
+        ({"fluid.viscosity": 1e-2}, 0.1),
+        ({"fluid.viscosity": 1e-4}, 10.0),
+        ({"fluid.viscosity": 1e-5, **printed}, 100.0),
+        ({"fluid.drag_rotation": 1.26e-7}, 10.0),
+        ({"fluid.drag_parallel": 0.8e-3, "fluid.drag_perpendicular": 0.7e-3}, 4.0),
+    ):
+        assert pace(with_values(paper_scene(name="paced"), values)) == pytest.approx(expected), values

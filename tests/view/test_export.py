@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import h5py  # noqa: TID253 (no command line starts here)
@@ -117,6 +118,35 @@ def test_csv_read_by_the_standard_library(record, tmp_path):
         ("1", "1"),
     ]
     assert float(nodes[83]["time"]) == record.times[1]
+
+
+def test_xyz_by_its_own_heading(record, tmp_path):
+    write_xyz(record, tmp_path / "run.xyz")
+    lines = (tmp_path / "run.xyz").read_text().splitlines()
+    assert len(lines) == 5 * (2 + 84)
+    for frame in range(5):
+        count, comment, *rows = lines[frame * 86 : (frame + 1) * 86]
+        assert count == "84" and f"Time={record.times[frame]:.9g}" in comment
+        columns = re.findall(r"(\w+):[SRI]:(\d)", comment.partition("Properties=")[2].split()[0])
+        found = [dict(_fields(columns, row.split())) for row in rows]
+        assert [own["species"] for own in found] == [["B"], *[["N"]] * 83]
+        body = found[0]
+        np.testing.assert_allclose(np.array(body["aspherical_shape"], float), [0.4, 0.4, 1.25])
+        assert (body["radius"], body["flagellum"]) == (["1.25"], ["-1"])  # of the sphere round it
+        np.testing.assert_allclose(np.array(body["pos"], float), record.body_position[frame], rtol=1e-8)
+        np.testing.assert_allclose(np.array(body["orientation"], float), record.body_orientation[frame], rtol=1e-8)
+        places = np.array([own["pos"] for own in found[1:]], float)
+        np.testing.assert_allclose(places, record.positions[frame], rtol=1e-8, atol=1e-9)
+        assert [own["flagellum"] for own in found[1:]] == [["0"]] * 31 + [["1"]] * 21 + [["2"]] * 31
+        assert {tuple(own["radius"]) for own in found[1:]} == {("0.01",)}
+
+
+def _fields(columns, values):
+    """Names of an extended XYZ file's columns, each with its own of the values of a row."""
+    assert len(values) == sum(int(width) for _, width in columns)
+    for name, width in columns:
+        yield name, values[: int(width)]
+        values = values[int(width) :]
 
 
 @pytest.mark.parametrize("write, name", [(write_csv, "run.csv"), (write_vtkhdf, "run.vtkhdf")])

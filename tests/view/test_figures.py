@@ -12,8 +12,12 @@ from tests.runs import executed, small
 from tests.shapes import Zipping
 from warpflag import cli
 from warpflag.base.output import OutputError
-from warpflag.scene import paper_scene, with_values
+from warpflag.observables.bundle import bundle_length
+from warpflag.record import Frame, Record
+from warpflag.record.recorder import Recorder
+from warpflag.scene import dumps, paper_scene, with_values
 from warpflag.view.coloring import FLAGELLUM_COLORS, linear
+from warpflag.view.curves import curves
 from warpflag.view.labels import labels_of
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -100,6 +104,23 @@ def test_one_flagellum_has_a_dashboard_without_a_bundle(tmp_path):
     panels = panels_of(figures.dashboard(directory))
     assert "swimming speed $v$ (µm/s)" in panels and LENGTH not in panels
     assert "swimming speed $v$ (µm/s)" in panels_of(figures.comparison([directory, directory]))
+
+
+def test_the_bundle_of_a_figure_passes_over_a_short_gap(tmp_path):
+    """Two lines beside each other but for 0.6 um: the record says a third, the figure all of it."""
+    first = np.stack([0.0 * np.arange(31), 0.0 * np.arange(31), 0.2 * np.arange(31)], axis=1)
+    second = first + np.array([0.3, 0.0, 0.0])
+    second[10:13, 0] += 1.0
+    recorder = Recorder(tmp_path / "run.h5")
+    scene = dumps(paper_scene(name="gap"))
+    recorder.start(scene, [0, 31, 62], filament_radius=0.01, body_length=2.5, body_width=0.8)
+    nodes = np.concatenate([first, second])
+    plain = float(bundle_length(nodes, np.array([0, 31, 62])))
+    at_rest = {"motor_angle": np.zeros(2), "body_position": np.zeros(3), "body_orientation": np.array([0.0, 0, 0, 1])}
+    recorder.write(Frame(0.0, 0, nodes, nodes, observables={"bundle_length": plain}, **at_rest))
+    recorder.close()
+    (drawn,) = (curve for curve in curves(Record(tmp_path)) if curve.name == "bundle_length")
+    assert plain < 0.4 and drawn.values.tolist() == [[1.0]]
 
 
 def test_forms_are_drawn_along_each_flagellum_one_above_the_other(tmp_path):

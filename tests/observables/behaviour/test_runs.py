@@ -83,6 +83,14 @@ def test_a_cell_that_turns_without_slowing_down():
     np.testing.assert_allclose(np.degrees(found.tumble_angles), 90, atol=6)
 
 
+def test_the_direction_of_a_run_is_not_that_of_its_bend():
+    """Averaged, the path bends half a window before a corner; a tumble that is found shorter has the corner's angle."""
+    corner = path([(0.6, 20.0, 0), (0.004, 20.0, 160), (0.6, 20.0, 0)])
+    found = runs_and_tumbles(*corner, turning=50.0, slow=0.0, reach=0.02)
+    assert len(found.tumbles) == 1 and np.diff(found.tumbles[0]) < 0.03
+    assert np.degrees(found.tumble_angles[0]) == pytest.approx(160, abs=0.1)
+
+
 def test_a_reversal_is_a_tumble_of_half_a_turn():
     times, forth = path([(0.6, 20.0, 0)])
     back = forth[::-1][1:]

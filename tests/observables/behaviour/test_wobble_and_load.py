@@ -27,6 +27,12 @@ def test_precession_and_nutation(rate):
     assert found.nutation_rate == pytest.approx(57.0, abs=0.1)
 
 
+def test_nutation_is_the_amplitude_however_few_frames_there_are():
+    angles = 0.3 + 0.04 * np.array([1.0, 0.0, -1.0, 0.0])  # a period of a cosine
+    found = wobble(TIMES[:4], axes(angles, 50.0 * TIMES[:4]), TURN[:, 2])
+    assert found.nutation == pytest.approx(0.04, rel=1e-9) and found.angle == pytest.approx(0.3, rel=1e-9)
+
+
 def test_a_steady_cone_has_no_nutation_and_a_steady_axis_no_precession():
     found = wobble(TIMES, axes(0.2 + 0 * TIMES, 50.0 * TIMES), TURN[:, 2])
     assert found.nutation < 1e-9 and np.isnan(found.nutation_rate)
