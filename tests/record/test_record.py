@@ -115,7 +115,16 @@ def test_mdanalysis_opens_it(tmp_path):
     [
         *(0, -1, slice(None), slice(3, 9), slice(-4, None), slice(2, 20, 5), slice(None, None, -2), slice(9, 3)),
         *(..., (slice(3, 9), 0), (4, slice(None), 2), (..., 2), [7, 2, 2], (slice(0, 4), [0, 3])),
-        *(None, (None, 4), ([7, 2], [0, 3]), ([7, 2], 3), (np.arange(23) > 20, [4, 4]), [[1, 2], [3, 4]], (3, [1, 0])),
+        *(
+            None,
+            (None, 4),
+            ([7, 2], [0, 3]),
+            ([7, 2], 3),
+            (np.arange(23) > 20, [4, 4]),
+            [[1, 2], [3, 4]],
+            (3, [1, 0]),
+            (True, 4),
+        ),
     ],
     ids=str,
 )

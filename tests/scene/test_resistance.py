@@ -14,8 +14,8 @@ import pytest
 from tests.helpers import attachment, cell, ground_state_frames, helix_axis, placed
 from tests.oracles import device_mobility
 from warpflag.run.simulation import Simulation
-from warpflag.scene import paper_scene, with_values
-from warpflag.scene.resistance import pace, spheroid_mobility
+from warpflag.scene import SceneError, paper_scene, with_values
+from warpflag.scene.resistance import pace, pair_radii, spheroid_mobility
 
 # Relative to resistive-force theory and to the numbers quoted below, which have three or four digits.
 TOLERANCE = {"float64": 5e-3, "float32": 5e-3}
@@ -161,3 +161,18 @@ def test_pace_is_that_of_the_easiest_motion():
         ({"fluid.drag_parallel": 0.8e-3, "fluid.drag_perpendicular": 0.7e-3}, 4.0),
     ):
         assert pace(with_values(paper_scene(name="paced"), values)) == pytest.approx(expected), values
+
+
+@pytest.mark.parametrize("mode", ["all", "within", "consistent"])
+def test_a_pair_radius_that_is_refused_names_one_that_is_taken(mode):
+    """Rounded up, whatever the segment length, and hardly more than is needed."""
+    for h in (0.1, 0.15, 0.2, 0.24, 0.3):
+        values = {"hydrodynamics.mode": mode, "flagella.segment_length": h, "hydrodynamics.pair_radius": 1e-3}
+        scene = with_values(paper_scene(name="given"), {"flagella.length": 6.0, **values})
+        with pytest.raises(SceneError, match="is the least that does not") as caught:
+            pair_radii(scene)
+        named = float(str(caught.value).partition("indefinite; ")[2].partition(" um")[0])
+        enough, less = (with_values(scene, {"hydrodynamics.pair_radius": a}) for a in (named, 0.97 * named))
+        assert pair_radii(enough) == [named] * 2
+        with pytest.raises(SceneError, match=f"{named:g} um is the least"):
+            pair_radii(less)

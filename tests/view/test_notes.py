@@ -12,6 +12,7 @@ from tests.films import made_record
 from tests.view.pictures import ink
 from warpflag import cli
 from warpflag.view import notes
+from warpflag.view.coloring import FORM_COLORS
 from warpflag.view.notes import Pen
 from warpflag.view.render import Renderer
 from warpflag.view.usd import Shot, movie_stage
@@ -73,6 +74,20 @@ def test_the_time_is_in_the_picture(run):
         corner = ink(renderer.picture(code))[:60, :200]
         alike = {other: likeness(corner, other, 1.2 * LETTER / 0.73) for other in texts.values()}
         assert max(alike, key=alike.__getitem__) == text and alike[text] > 0.6
+
+
+def test_the_legend_of_forms_has_each_name_beside_its_colour():
+    """A long name, told by how far its row reaches, in turn at every colour."""
+    for long in range(3):
+        pen = Pen(np.full((540, 960, 3), 245, np.uint8), LETTER)
+        pen.write_legend(1.0, "form", 2.0, ["a form of a long name" if k == long else "i" for k in range(3)])
+        reach = []
+        for color in FORM_COLORS:
+            rgb = np.frombuffer(bytes.fromhex(color[1:]), dtype=np.uint8)
+            rows = (pen.picture == rgb).all(axis=2).any(axis=1)
+            assert rows.any()
+            reach.append((pen.picture[rows] != 245).any(axis=(0, 2)).nonzero()[0].max())
+        assert int(np.argmax(reach)) == long and sorted(reach)[-1] > sorted(reach)[-2] + 40
 
 
 def test_a_legend_says_what_colours_mean(run, tmp_path):
