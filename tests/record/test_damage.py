@@ -119,6 +119,18 @@ def test_every_truncation_is_refused_in_one_line(tmp_path):
         refusal(path)
 
 
+def test_a_record_that_claims_more_than_fits_its_file_is_refused_before_it_is_read(tmp_path):
+    """Datasets made long take no space in a file, but their checksums alone would take all memory."""
+    path = written(tmp_path / "run.h5", 4)
+    with h5py.File(path, "r+") as file:
+        found = []
+        file.visititems(lambda name, own: found.append(own) if isinstance(own, h5py.Dataset) and own.chunks else None)
+        for dataset in found:
+            dataset.resize(10**12, axis=0)
+    with pytest.raises(RecordError, match="beside 1000000000000 frames"):
+        _ = Record(path).times
+
+
 def test_a_record_that_claims_more_frames_than_it_holds_is_refused(tmp_path):
     path = written(tmp_path / "run.h5", 5)
     with h5py.File(path, "r+") as file:
