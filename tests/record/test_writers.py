@@ -159,6 +159,16 @@ def test_resume_needs_a_record_of_the_same_flagella(tmp_path):
         assert_holds_frames(record, range(3))
 
 
+def test_a_record_that_is_cut_to_nothing_begins_anew(tmp_path):
+    path = written(tmp_path / "run.h5", 3)
+    recorder = started(path, resume_step=-1)
+    for index in range(2):
+        recorder.write(frame(index))
+    recorder.close()
+    with Record(tmp_path) as record:
+        assert_holds_frames(record, range(2))
+
+
 @pytest.mark.parametrize("closed", [False, True], ids=["same start", "started again"])
 def test_a_record_takes_no_frame_twice_and_none_of_before(tmp_path, closed):
     recorder = started(tmp_path / "run.h5")
