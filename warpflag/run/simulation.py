@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time as clock
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -34,6 +35,8 @@ from warpflag.stepping.replay import Replay
 __all__ = ["CellState", "Evaluation", "NumericalError", "Simulation"]
 
 _SECONDS_PER_BLOCK = 0.25  # of frames: what an interrupted run loses of its last frames
+_MOST_SECONDS_PER_BLOCK = 2.0  # where handing frames over takes long, as it does of a thousand cells
+_SHARE_OF_BLOCKS = 0.1  # of the time that then goes into handing over
 
 
 class Simulation:
@@ -178,9 +181,13 @@ class Simulation:
         self.prepare(recording=True)
         if (self._frames.index < 0).all():
             yield self._frames.first(self._present_state())
+        seconds = _SECONDS_PER_BLOCK
         while self._schedule(until):
-            self._advance(self._frames.targets(until), watch, _SECONDS_PER_BLOCK)
+            self._advance(self._frames.targets(until), watch, seconds)
+            began = clock.perf_counter()
             yield self._collect(until)
+            taken = clock.perf_counter() - began
+            seconds = min(max(taken / _SHARE_OF_BLOCKS, _SECONDS_PER_BLOCK), _MOST_SECONDS_PER_BLOCK)
 
     def _going_on(self) -> np.ndarray:
         """Cells that no guard has stopped and nobody has excluded, shape [cell_count]."""
