@@ -4,10 +4,10 @@
 
 number: 2, 5 and 8 flagella on one body, beside Lisevich et al. 2024 (2.12, 4.76, 7.57 flagella a cell).
 length: bodies of 2 to 6 um with 2 to 6 flagella, beside Kamdar et al. 2023 (speed independent of body length).
-viscosity: 1 to 8 flagella in 1, 2, 4 and 8 times the viscosity of water, beside Tatulea-Codrean & Lauga 2024 (a speed
+viscosity: 1 to 16 flagella in 1, 2, 4 and 8 times the viscosity of water, beside Tatulea-Codrean & Lauga 2024 (a speed
     that peaks at a number of flagella, and at more flagella in a more viscous fluid).
 Flagella of 7.5 um begin bundled at the rear pole; motors on the 175/300 Hz curve with a stall of 1.26 pN um; format 1.
-A minute of one core. Means over the second half of each run. Units: um, pN, s.
+A minute of one core, viscosity five. Means over the second half of each run. Units: um, pN, s.
 """
 
 import argparse
@@ -26,7 +26,9 @@ options = options.parse_args()
 CELLS = {  # flagella, body length [um], viscosity over that of water, and what was measured or calculated elsewhere
     "number": [(2, 2.5, 1, "22.4, body 30"), (5, 2.5, 1, "26.6, body 37"), (8, 2.5, 1, "24.7, body 38")],
     "length": [(number, float(number), 1, "the same speed for all") for number in (2, 3, 4, 5, 6)],
-    "viscosity": [(number, 2.5, viscosity, "") for viscosity in (1, 2, 4, 8) for number in (1, 2, 3, 4, 6, 8)],
+    "viscosity": [
+        (number, 2.5, viscosity, "") for viscosity in (1, 2, 4, 8) for number in (1, 2, 3, 4, 6, 8, 10, 12, 16)
+    ],
 }
 
 
