@@ -150,6 +150,7 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     assert loaded == {
         "clock",
         "rkc.float64.fast.cells",
+        "rkc_estimate.float64.fast",
         "reconstruction.float64.fast",
         "chart.float64.fast",
         "whole_cell.float64.fast.motor_elastic_bearing_none_none",

@@ -102,8 +102,12 @@ def test_what_can_t_be_shown_is_told(record, tmp_path):
     shutil.copy(record.path, tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5", "r+") as file:  # of a version without checksums
         del file["checksums"]
-        file["particles/flagella/position/value"][3] = np.nan
-    with pytest.raises(OutputError, match="not finite"):
+        file["cell/motor_angle/value"][3] = np.nan
+    with pytest.raises(OutputError, match="motor angles that are not finite"):
+        page_of(Record(tmp_path))
+    with h5py.File(tmp_path / "run.h5", "r+") as file:
+        file["particles/flagella/position/value"][3] = np.inf
+    with pytest.raises(OutputError, match="holds positions that are not finite"):
         page_of(Record(tmp_path))
 
 

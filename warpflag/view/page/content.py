@@ -46,6 +46,10 @@ def content(record: Record, color_by: str, follow: bool, most_bytes: int | None)
     frames = _kept(record, most_bytes)
     positions = record.positions[frames]
     centres = record.body_position[frames]
+    drawn = {"positions": positions, "body positions": centres, "body orientations": record.body_orientation[frames]}
+    for name, values in {**drawn, "motor angles": record.motor_angle[frames]}.items():
+        if not np.isfinite(values).all():
+            raise OutputError(f"the record holds {name} that are not finite, which no page can show")
     relative = positions - centres[:, None]
     low, high = relative.min(axis=(0, 1)), relative.max(axis=(0, 1))
     step = np.where(high > low, (high - low) / _COORDINATE_STEPS, 1.0)

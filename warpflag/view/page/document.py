@@ -49,15 +49,12 @@ def page_of(record: Record, color_by: str = "flagellum", follow: bool = True, mo
         most_bytes: frames are left out evenly until positions and colours take no more than this; None: all stay.
 
     Raises:
-        OutputError: an unknown quantity, or positions that are not finite.
+        OutputError: an unknown quantity, or numbers that are not finite where the cell is drawn.
         RecordError: a record without frames.
     """
     shown = content(record, color_by, follow, most_bytes)
-    try:
-        # Within <script> only "</" could end the element.
-        written = json.dumps(shown, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    except ValueError:
-        raise OutputError("the record holds positions that are not finite, which no page can show") from None
+    # Within <script> only "</" could end the element.
+    written = json.dumps(shown, ensure_ascii=False, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     parts = {
         "title": html.escape(shown["name"]),
         "style": _part("page.css"),
