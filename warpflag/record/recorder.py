@@ -97,6 +97,11 @@ class Recorder:
         """Frames in the record so far, those not yet committed included: the index of the next frame."""
         return self._committed + sum(len(values["step"]) for values in self._pending)
 
+    @property
+    def scene_sha256(self) -> str:
+        """SHA-256 of the scene text that /parameters holds, in hexadecimal digits; valid after `start`."""
+        return self._parameters["scene_sha256"]
+
     def start(
         self,
         scene_text: str,

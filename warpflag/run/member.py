@@ -205,8 +205,7 @@ class Member:
             found, grown, taken = digest(record, self.scene, self.recorder.kept()), follow(record), self.wall_time
             growth = {"factor": grown.factor, "from": grown.start, "within": grown.within} if grown else None
             ending = {"status": status, "message": str(fault) if fault else "", "wall_time": taken}
-            ending["scene_sha256"] = record.scene_sha256
-            summary = {**ending, **facts, "growth": growth, **found}
+            summary = {**ending, "scene_sha256": self.recorder.scene_sha256, **facts, "growth": growth, **found}
             write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
             left_out = "" if not movie or ended is None else "; movie left out"
             if movie and ended is None:
