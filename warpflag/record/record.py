@@ -6,6 +6,7 @@ checksums as they are read. Records of versions that wrote no checksums are read
 
 from __future__ import annotations
 
+import math
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -239,7 +240,7 @@ class Record:
         Raises:
             ValueError: a time is no number.
         """
-        if start != start or stop != stop:
+        if any(time is not None and math.isnan(time) for time in (start, stop)):
             raise ValueError(f"a window is between two times, not {start} and {stop}")
         times = self.times
         start = times[0] + 2 / 3 * (times[-1] - times[0]) if start is None else start
