@@ -34,7 +34,7 @@ UNSTABLE = 100.0
 PATIENCE = 20.0
 """Computing time that may go into following a run [s]."""
 _DISTURBANCE = {"float64": 1.0e-6, "float32": 1.0e-4}  # um, above round-off and far below contact distances
-_FEW_STEPS = 100.0  # of a pair, up to which launching every kernel takes less than capturing them
+_FEW_STEPS = 100.0  # of one pass each, up to which launching every kernel takes less than capturing them
 _LOOKS = 10  # at the pair while it is followed: growth is told at the first that shows it
 
 
@@ -147,7 +147,8 @@ def _looks(
         steps = {"numerics.time_step": taken, "numerics.accuracy": None}
         followed = with_values(scene, {"numerics.on_accuracy": "warn", **steps})
         starts = [start, dataclasses.replace(start, positions=tuple(moved))]
-        pair = Simulation([followed, followed], device=device, starts=starts, capture=_FEW_STEPS * taken < FOLLOWED)
+        many = followed.numerics.stepper == "rkc" or _FEW_STEPS * taken < FOLLOWED  # RKC: a pass for every stage
+        pair = Simulation([followed, followed], device=device, starts=starts, capture=many)
         for k in range(_LOOKS):
             within = FOLLOWED * (k + 1) / _LOOKS
             pair.advance(within, watch)
