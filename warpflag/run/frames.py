@@ -166,10 +166,9 @@ class Frames:
         """
         assert self._dense is not None
         dense, slots = self._dense.data, self._dense.slots
-        most = 1 if self._end_steps else slots
         ends = self._durations if until is None else until
         last = np.floor(ends / self._durations * self._counts + _ROUNDING).astype(np.int64)
-        counts = np.where(waiting, np.clip(last - self.index, 0, most), 0)
+        counts = np.where(waiting, np.clip(last - self.index, 0, slots), 0)
         numbers = self.index[:, None] + 1 + np.arange(slots)
         self._wanted = self._durations[:, None] * numbers / self._counts[:, None]
         self._ends = self._durations * last / self._counts
@@ -179,12 +178,17 @@ class Frames:
         self._scheduled = counts
         return bool(counts.any())
 
-    def targets(self, until: float | None) -> np.ndarray:
-        """Where steps of each cell end [s]: at `until`, at frames only if the stepper has to, shape [cell_count]."""
+    def targets(self, until: float | None) -> Iterator[np.ndarray]:
+        """Where steps of each cell end [s], one after the other, shape [cell_count]; 0: of a cell with no more frames.
+
+        At `until`, and at every scheduled frame only if the stepper has to.
+        """
         if self._end_steps:
-            return np.where(self._scheduled > 0, self._wanted[:, 0], 0.0)
+            for k in range(int(self._scheduled.max(initial=0))):
+                yield np.where(self._scheduled > k, self._wanted[:, k], 0.0)
+            return
         beyond = np.full(len(self._ends), _FAR_FUTURE) if until is None else np.maximum(self._ends, until)
-        return np.where(self._scheduled > 0, beyond, 0.0)
+        yield np.where(self._scheduled > 0, beyond, 0.0)
 
     def collect(self, until: float | None, waiting: np.ndarray, times: np.ndarray) -> list[dict[int, FrameRows]]:
         """All frames up to the times that the cells have reached: the next one of each cell, by cell, and so on.

@@ -183,7 +183,12 @@ class Simulation:
             yield self._frames.first(self._present_state())
         seconds = _SECONDS_PER_BLOCK
         while self._schedule(until):
-            self._advance(self._frames.targets(until), watch, seconds)
+            began = clock.perf_counter()
+            for targets in self._frames.targets(until):
+                left = seconds - (clock.perf_counter() - began)
+                if left <= 0.0:
+                    break
+                self._advance(targets, watch, left)
             began = clock.perf_counter()
             yield self._collect(until)
             taken = clock.perf_counter() - began
