@@ -28,7 +28,15 @@ from warpflag_kernels.rod import chain_chart, comoving_chart, forces, hessian, r
 from warpflag_kernels.stepping import dense_output, evaluation_time, health, terms
 from warpflag_kernels.stepping.frame_slots import DenseOutput
 from warpflag_kernels.stepping.right_hand_side import launch_right_hand_side
-from warpflag_kernels.thermal import additive_chart, closing, end_strains, equilibrium, mean_drift, strain_gradients
+from warpflag_kernels.thermal import (
+    additive_chart,
+    closing,
+    end_strains,
+    equilibrium,
+    mean_drift,
+    strain_gradients,
+    turned_forces,
+)
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import thermal_energy
@@ -110,7 +118,7 @@ class ThermalStepper:
             law = delassus.allocate(model, contacts)
             quasi_newton.allocate(model, contacts, law)
             self.flow = step_flow.allocate(model)
-            self.drift = mean_drift.allocate(model)
+            self.drift, self._turned = mean_drift.allocate(model), turned_forces.allocate(model)
             self.stiffness, self.strains = hessian.allocate(model), strain_gradients.allocate(model)
             self._solved, self._product = chain_chart.allocate(model), chain_chart.allocate(model)
             self._linear = chain_chart.allocate(model)
@@ -159,7 +167,7 @@ class ThermalStepper:
         x = self._x if explicit else self._solve()
         additive_chart.retract(model, state, s.chart, x, self._work, restoring=not explicit)
         if not explicit:
-            end_strains.owe_tensions(model, state, self.strains, s.control.step, self._work)
+            turned_forces.find(model, state, s.chart, self.strains, x, s.control.steps, self._turned)
         listed = parts.contacts if self._touching else None
         health.check(model, state, s.chart, s.guard, s.control, listed)
         equilibrium.decide(model, state, parts, explicit)
@@ -222,6 +230,7 @@ class ThermalStepper:
                 term.launch(model, state)
         strain_gradients.find(model, state, self.strains)
         strain_gradients.add_random_moments(model, state, self.strains, self.noise, s.control.steps, share)
+        turned_forces.add(model, state, self._turned)
         forces.total_forces(model, state, self._smooth_terms)
         if self._touching:
             equilibrium.random_contacts(model, state, parts, self.noise, share, self._magnitude)
@@ -310,7 +319,8 @@ class ThermalStepper:
         """What an implicit step leaves to the next one."""
         if self._explicit:
             return {}
-        return {"owed": self._work.owed} | {f"drift_{name}": getattr(self.drift, name) for name in mean_drift.CARRIED}
+        left = {"owed": self._work.owed} | {f"drift_{name}": getattr(self.drift, name) for name in mean_drift.CARRIED}
+        return left | {f"turned_{name}": getattr(self._turned, name) for name in turned_forces.CARRIED}
 
     def restart(self) -> None:
         """Nothing is left over from earlier steps."""

@@ -8,7 +8,7 @@ from typing import Any
 from unittest.mock import patch
 
 from warpflag_kernels.fluid import noise
-from warpflag_kernels.thermal import end_strains, equilibrium, mean_drift, strain_gradients
+from warpflag_kernels.thermal import end_strains, equilibrium, mean_drift, strain_gradients, turned_forces
 
 from .ensembles import ensemble
 from .joints import FLOW, HOOKED
@@ -38,8 +38,9 @@ def cost(share: float) -> None:
                         stack.enter_context(patch.object(noise, "draw_local", lambda *_, **_k: None))
                         stack.enter_context(patch.object(strain_gradients, "add_random_moments", lambda *_: None))
                         stack.enter_context(patch.object(equilibrium, "random_contacts", _quiet_contacts))
-                        for step in ("correct", "owe_tensions"):
-                            stack.enter_context(patch.object(end_strains, step, lambda *_: None))
+                        stack.enter_context(patch.object(end_strains, "correct", lambda *_: None))
+                        for step in ("find", "add"):
+                            stack.enter_context(patch.object(turned_forces, step, lambda *_: None))
                         for step in ("add_forces", "add_velocities", "remember"):
                             stack.enter_context(patch.object(mean_drift, step, lambda *_: None))
                         stack.enter_context(patch.object(sim.stepper, "draw_flows", lambda **_: None))

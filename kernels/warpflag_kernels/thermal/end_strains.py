@@ -14,9 +14,7 @@ the flow: what it would change is a small share of a small force. Forces come in
 The axes of joints without rest curvature are free to turn under their bends (`strain_gradients`): strains of these are
 compared in axes that have not turned.
 
-**Along segments.** Bends have no force along their segments. But J^T k (w - w_0) at the end of a step, J at its start,
-has one along segments that have turned, and lengths would be too short on average by it: the next step takes it back,
-as it does with the tensions that restored lengths (`additive_chart`).
+J stays that of the start: the next step has what the turn of segments changes of these forces (`turned_forces`).
 """
 
 import functools
@@ -42,7 +40,7 @@ STRAIN_ITERATIONS = 2
 def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
     real, vec3, vec4 = p.real, p.vec3, p.vec4
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
-    Strains, Additive = strain_gradients.struct(p), additive_chart.struct(p)
+    Strains = strain_gradients.struct(p)
     Increment, vec6 = chain_chart.types(p).Increment, chain_chart.types(p).vec6
     displacement = chain_chart.displacement(p)
     f, r = strain_gradients.functions(p), rotations.functions(p)
@@ -133,43 +131,7 @@ def _kernels(p: Precision, shell: bool) -> SimpleNamespace:
                 y.body[c] = -vec6(u[0], u[1], u[2], w[0], w[1], w[2])
         y.node[e] = -vec4(g[0], g[1], g[2], state.spin_torque[e])
 
-    @wp.func(module=module)
-    def load(model: Model, state: State, i: wp.int32, k: wp.int32):
-        """k (w - w_0) of the joint after segment i, at the end."""
-        w = strain(state, i)
-        if i == model.first_node[k]:
-            w = vec3(zero, zero, w[2])
-        else:
-            w -= model.rod.rest_strain[i]
-        return wp.cw_mul(joint_stiffness(model, i, k), w)
-
-    @wp.kernel(module=module)
-    def owe_tensions(
-        # Model:
-        model: Model,
-        # State:
-        state: State,
-        strains: Strains,
-        step: wp.array(dtype=wp.float64),
-        # Out:
-        a: Additive,
-    ):
-        """Adds what the joints' forces at the end, with J at the start, do along a segment as it has turned."""
-        e = wp.tid()
-        c = model.cell_of[e]
-        if state.active[c] == 0:
-            return
-        k = model.flagellum_of[e]
-        if e == model.first_node[k]:
-            return
-        gradient = vec3(zero)
-        if joined(model, e, k):
-            gradient += wp.transpose(strains.by_first[e]) * load(model, state, e, k)
-        if joined(model, e - 1, k):
-            gradient += wp.transpose(strains.by_second[e - 1]) * load(model, state, e - 1, k)
-        a.owed[e] = a.owed[e] - real(step[c]) * wp.dot(gradient, state.pose.tangent[e])
-
-    return SimpleNamespace(missed=missed, right_hand_side=right_hand_side, owe_tensions=owe_tensions)
+    return SimpleNamespace(missed=missed, right_hand_side=right_hand_side)
 
 
 def _kernels_of(model: DeviceModel) -> SimpleNamespace:
@@ -205,16 +167,3 @@ def correct(
         wp.launch(kernels.right_hand_side, elements, inputs=[model.data, state.data, y], device=device)
         linearised.solve(model, state, band, y)
         closing.set_difference(model, state, linear, y, x)
-
-
-def owe_tensions(model: DeviceModel, state: DeviceState, strains: Any, step: Any, work: Any) -> None:
-    """Adds to the tensions that the next step takes back what forces of the joints do along segments that have turned.
-
-    Args:
-        model, state: of the batch, its pose at the end of the step, lengths restored.
-        strains: struct `Strains`, of the start.
-        step: length of the step [s], shape [cell_count].
-        work: struct `Additive`.
-    """
-    inputs = [model.data, state.data, strains, step, work]
-    wp.launch(_kernels_of(model).owe_tensions, model.element_count, inputs=inputs, device=model.device)
