@@ -301,17 +301,19 @@ def _kernels(p: Precision, with_self: bool) -> SimpleNamespace:
         while e < model.first_node[k + 1]:
             if e > model.first_node[k]:
                 longest = wp.max(longest, state.pose.length[e])
-            moved = wp.max(moved, wp.length(state.pose.position[e] - guard.position[e]))
-            shifted = wp.max(shifted, wp.length(state.pose.position[e] - near.position[e]))
-            shifted = wp.max(shifted, wp.length(guard.position[e] - near.position[e]))
+            x = state.pose.position[e]
+            checked = guard.position[e]
+            moved = wp.max(moved, wp.length_sq(x - checked))
+            shifted = wp.max(shifted, wp.length_sq(x - near.position[e]))
+            shifted = wp.max(shifted, wp.length_sq(checked - near.position[e]))
             if listed.position.shape[0] > 0:
-                strayed = wp.max(strayed, wp.length(state.pose.position[e] - listed.position[e]))
-                strayed = wp.max(strayed, wp.length(guard.position[e] - listed.position[e]))
+                strayed = wp.max(strayed, wp.length_sq(x - listed.position[e]))
+                strayed = wp.max(strayed, wp.length_sq(checked - listed.position[e]))
             e += 1
         guard.longest[k] = longest
-        guard.moved[k] = moved
-        guard.shifted[k] = shifted
-        guard.strayed[k] = strayed
+        guard.moved[k] = wp.sqrt(moved)
+        guard.shifted[k] = wp.sqrt(shifted)
+        guard.strayed[k] = wp.sqrt(strayed)
 
     @wp.kernel(module=module)
     def remember(
