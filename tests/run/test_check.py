@@ -129,6 +129,18 @@ def test_a_stiff_helix_feels_its_own_flow_where_the_mode_has_it():
     assert rate["within"] == rate["all"] > 1.1 * rate["none"] and rate["between"] == rate["none"]
 
 
+def test_stiff_helices_side_by_side_drag_each_other_along_where_the_mode_couples_them():
+    """Neighbours in phase turn faster, and their rate depends less on the mesh, as the flow of all is smoother."""
+    for mode, ratio in {"none": 1.0, "within": 1.0}.items():
+        scene = small({"hydrodynamics.mode": mode})
+        assert turning(scene, None, 3).rate == pytest.approx(ratio * turning(scene).rate, rel=1e-9)
+    scene = small()
+    rates = [turning(scene, None, count).rate for count in (1, 2, 3)]
+    assert rates[0] < rates[1] < rates[2] < 3 * rates[0]
+    alone, three = (mesh_dependence(small({"flagella.count": count}), 0.5) for count in (1, 3))
+    assert alone is not None and three is not None and alone < 0.8 * three < 0
+
+
 @pytest.mark.parametrize("mode, length, torque", [("all", 3.0, 2.0), ("none", 4.0, 1.0)])
 def test_the_mesh_error_is_told_within_a_factor_of_two(mode, length, torque):
     """Beside the rate of a single flagellum on an anchored body, on both meshes."""

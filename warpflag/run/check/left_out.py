@@ -103,7 +103,7 @@ def self_contact(scene: Scene, stiff: Turning) -> str | None:
 
 
 def mesh(scene: Scene, stiff: Turning) -> str | None:
-    """Rate of the stiff flagellum on this mesh and on one half as long."""
+    """Rate of a bundle of stiff flagella on this mesh and on one half as long."""
     found = mesh_dependence(scene, 0.5)
     if found is None:
         return None

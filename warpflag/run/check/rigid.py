@@ -1,4 +1,5 @@
-"""A single stiff flagellum that a motor turns about its helix axis: a rough rate, and how it depends on the mesh."""
+"""A stiff flagellum that a motor turns about its helix axis, alone or in a bundle: its rate, and how that depends on
+the mesh."""
 
 from __future__ import annotations
 
@@ -10,9 +11,12 @@ from warpflag.model.shell import rotne_prager
 from warpflag.observables.arrays import Array, unit
 from warpflag.scene import FlagellumSpec, Scene, SceneError, with_values
 from warpflag.scene.helix import ground_state
-from warpflag.scene.resistance import filament_mobility, pair_radius
+from warpflag.scene.resistance import filament_mobility, pair_radius, steric_diameter
 
 __all__ = ["Turning", "mesh_dependence", "turning"]
+
+_SPACING = 2.5  # of flagella in a bundle [sigma], at which rates change with the mesh as measured; docs/tradeoff.md
+_MOST_NODES = 1000  # of such a bundle: larger ones are represented by fewer flagella
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,15 @@ class Turning:
     drag: float
 
 
-def turning(scene: Scene, segment_length: float | None = None) -> Turning:
+def turning(scene: Scene, segment_length: float | None = None, together: int = 1) -> Turning:
     """The longest flagellum of a scene, with other segments where a length is given [um].
 
-    Nodes have the scene's local mobility and, in modes that sum pairs of one flagellum, its Rotne-Prager sum.
+    Nodes have the scene's local mobility and, in modes that sum pairs, its Rotne-Prager sum.
+
+    Args:
+        scene: to look at.
+        segment_length: of other segments [um].
+        together: so many such flagella side by side in a ring, in phase, each turning about its own axis.
 
     Raises:
         SceneError: segments of this length are not allowed.
@@ -49,11 +58,11 @@ def turning(scene: Scene, segment_length: float | None = None) -> Turning:
     helix = ground_state(scene.flagella.strain_at_rest(h), h)
     turn = helix.angle * (np.arange(spec.segment_count + 1))
     x = np.stack([helix.radius * np.cos(turn), helix.radius * np.sin(turn), helix.rise * np.arange(len(turn))], axis=1)
-    mobility = _mobility(scene, spec, x)
-    moves = np.zeros((2, len(x), 3))  # unit rotation about z, and unit translation along it
-    moves[0, :, 0], moves[0, :, 1], moves[1, :, 2] = -x[:, 1], x[:, 0], 1.0
+    mobility = _mobility(scene, spec, x, together)
+    moves = np.zeros((2, together, len(x), 3))  # unit rotation about z, and unit translation along it
+    moves[0, :, :, 0], moves[0, :, :, 1], moves[1, :, :, 2] = -x[:, 1], x[:, 0], 1.0
     flat = moves.reshape(2, -1)
-    resistance = flat @ np.linalg.solve(mobility, flat.T)
+    resistance = flat @ np.linalg.solve(mobility, flat.T) / together
     spin = spec.segment_count / filament_mobility(scene, h).spin  # segments also turn about themselves
     about = resistance[0, 0] + spin * (helix.rise / h) ** 2 - resistance[0, 1] ** 2 / resistance[1, 1]
     rate = abs(spec.torque) / about
@@ -61,26 +70,38 @@ def turning(scene: Scene, segment_length: float | None = None) -> Turning:
     return Turning(rate / (2 * np.pi), float(x[-1, 2]), helix.radius, rate * helix.radius, drag)
 
 
-def _mobility(scene: Scene, spec: FlagellumSpec, x: Array) -> Array:
-    """Of the nodes of one flagellum, shape [3 node_count, 3 node_count]."""
-    count, local = len(x), filament_mobility(scene, spec.segment_length)
+def _mobility(scene: Scene, spec: FlagellumSpec, x: Array, together: int) -> Array:
+    """Of the nodes of flagella of this shape side by side, shape [3 nodes, 3 nodes]."""
+    local, mode = filament_mobility(scene, spec.segment_length), scene.hydrodynamics.mode
     tangents = unit(np.gradient(x, axis=0))
     along = np.einsum("ni,nj->nij", tangents, tangents)
-    weight = np.where(np.arange(count) == count - 1, 2.0, 1.0)[:, None, None]
+    weight = np.where(np.arange(len(x)) == len(x) - 1, 2.0, 1.0)[:, None, None]
     own = weight * (local.along * along + local.across * (np.eye(3) - along))
+    turn = 2 * np.pi * np.arange(together) / together
+    radius = 0.0 if together == 1 else _SPACING * steric_diameter(scene) / (2 * np.sin(np.pi / together))
+    axes = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(together)], axis=1)
+    nodes = (axes[:, None] + x).reshape(-1, 3)
+    count = len(nodes)
     m = np.zeros((count, 3, count, 3))
-    if scene.hydrodynamics.mode in ("within", "all", "as_printed", "consistent"):
+    if mode != "none":
         a = pair_radius(scene, spec.segment_length)
-        m += rotne_prager(x, a, x, a) / (8 * np.pi * scene.fluid.viscosity)
-    m[np.arange(count), :, np.arange(count), :] = own
+        m += rotne_prager(nodes, a, nodes, a) / (8 * np.pi * scene.fluid.viscosity)
+        flagellum = np.repeat(np.arange(together), len(x))
+        same = flagellum[:, None] == flagellum
+        summed = {"within": same, "between": ~same}.get(mode)
+        if summed is not None:
+            m *= summed[:, None, :, None]
+    m[np.arange(count), :, np.arange(count), :] = np.tile(own, (together, 1, 1))
     return m.reshape(3 * count, 3 * count)
 
 
 def mesh_dependence(scene: Scene, finer: float) -> float | None:
-    """Relative change of the stiff flagellum's rate from segments `finer` times as long to the scene's; None: not
-    allowed."""
+    """Relative change of a stiff flagellum's rate from segments `finer` times as long to the scene's, in a bundle of as
+    many as the scene has; None: not allowed."""
     try:
-        h = max(spec.segment_length for spec in scene.resolved_flagella())
-        return turning(scene).rate / turning(scene, finer * h).rate - 1.0
+        specs = scene.resolved_flagella()
+        h, nodes = max(own.segment_length for own in specs), max(own.segment_count for own in specs) / finer + 1
+        together = min(len(specs), max(1, int(_MOST_NODES / nodes)))
+        return turning(scene, None, together).rate / turning(scene, finer * h, together).rate - 1.0
     except (SceneError, np.linalg.LinAlgError):
         return None
