@@ -20,10 +20,15 @@ from warpflag.run.stop import Stop
 from warpflag.run.sweep.batches import Batch
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Pool"]
+__all__ = ["HANDED_BACK", "WORTH_SHARING", "Pool", "Worker"]
 
 _SECONDS_PER_LOOK = 0.1  # at the workers: a moment for a person, nothing beside a member
 _MODULE = "warpflag.run.sweep.worker"
+HANDED_BACK = "handed back"
+"""Status of members that a worker has given up so that others can take them."""
+WORTH_SHARING = 2.0
+"""Seconds that a batch still takes from which on it is shared with a worker that has none left: what that costs,
+four times."""
 
 
 @contextlib.contextmanager
@@ -45,11 +50,21 @@ class Worker:
     Args:
         device: of its runs.
         starter: what forks its process; None: it is started anew.
+
+    Attributes:
+        reached: simulated time that the members of its batch have reached together [s].
+        members_left: of its batch that still go on.
+        seconds_left: wall time that they will take [s]; 0 while that is not known.
+        thread: that talks with the process.
+        batch: number of the batch that it runs; None: it has nothing to do.
+        asked: whether it was asked to hand that back.
     """
 
     def __init__(self, device: str, starter: Starter | None) -> None:
-        self.device, self.reached = device, 0.0
+        self.device, self.reached, self.members_left, self.seconds_left = device, 0.0, 0, 0.0
         self.thread: threading.Thread | None = None
+        self.batch: int | None = None
+        self.asked = False
         self._starter = starter
         self.process = self._started()
 
@@ -81,10 +96,19 @@ class Worker:
                 answer = json.loads(line)
                 if "reached" not in answer:
                     return answer
-                self.reached = answer["reached"]
+                self.reached, self.members_left = answer["reached"], answer["members_left"]
+                self.seconds_left = answer["seconds_left"]
         except (BrokenPipeError, ValueError):
             pass
         return {"outcomes": None}
+
+    def hand_back(self) -> None:
+        """Has it end its batch resumable, the members that are done excepted."""
+        self.asked = True
+        with contextlib.suppress(OSError, ValueError):  # it has ended, which its thread finds as well
+            assert self.process.stdin is not None
+            self.process.stdin.write(json.dumps({"hand_back": self.batch}) + "\n")
+            self.process.stdin.flush()
 
     def restart(self) -> str:
         """Starts a process anew; returns how the one before it ended."""
@@ -120,9 +144,9 @@ class Pool:
         worker: Callable[[str, Starter | None], Any] = Worker,
     ) -> None:
         self.devices, self._options, self._starter, self._worker = list(devices), dict(options), starter, worker
-        self._queue: queue.Queue[Batch] = queue.Queue()
+        self._queue: queue.Queue[tuple[int, Batch]] = queue.Queue()
         self._finished: queue.Queue[tuple[Batch, list[Outcome], float]] = queue.Queue()
-        self._open, self._done_time, self._ending = 0, 0.0, ""
+        self._open, self._submitted, self._done_time, self._ending = 0, 0, 0.0, ""
         self._workers: list[Worker] = []
         self._batch_ended = threading.Event()
 
@@ -166,6 +190,11 @@ class Pool:
         return self._open == 0
 
     @property
+    def idle(self) -> int:
+        """How many workers have nothing to do."""
+        return sum(worker.batch is None for worker in self._workers)
+
+    @property
     def reached(self) -> float:
         """Simulated time that all members have reached [s]."""
         return self._done_time + sum(worker.reached for worker in self._workers)
@@ -187,14 +216,18 @@ class Pool:
     def submit(self, batch: Batch) -> None:
         """Queues a batch; the workers begin with the first."""
         self._open += 1
-        self._queue.put(batch)
+        self._submitted += 1
+        self._queue.put((self._submitted, batch))
         for worker in self._workers:
             if worker.thread is None:
                 worker.thread = threading.Thread(target=self._serve, args=(worker,), daemon=True)
                 worker.thread.start()
 
     def finished(self) -> list[tuple[Batch, list[Outcome]]]:
-        """Batches that have ended since the last call, and how each of their members ended."""
+        """Batches that have ended since the last call, and how each of their members ended.
+
+        Members that are `HANDED_BACK` go on where they were once they are submitted again.
+        """
         found = []
         while not self._finished.empty():
             batch, outcomes, reached = self._finished.get()
@@ -203,6 +236,18 @@ class Pool:
             self._done_time += max(sum(done), reached)  # a member that was stopped has come as far as it was seen
             self._open -= 1
         return found
+
+    def balance(self) -> None:
+        """Has the batch that will end last handed back, where a worker has nothing left to do and that is worth it.
+
+        Only then: a batch loses what starts and ends it, some tenths of a second, and nothing is lost where all
+        workers end together.
+        """
+        if not self.idle or not self._queue.empty() or any(w.asked and w.batch is not None for w in self._workers):
+            return
+        shared = [w for w in self._workers if w.members_left > 1 and w.seconds_left > WORTH_SHARING]
+        if shared:
+            max(shared, key=lambda worker: worker.seconds_left).hand_back()
 
     def wait(self) -> None:
         """Waits for a moment, or until a batch has ended."""
@@ -227,10 +272,12 @@ class Pool:
         """Hands batches to a worker until none is left."""
         while not self._ending:
             try:
-                batch = self._queue.get(timeout=_SECONDS_PER_LOOK)
+                worker.batch, batch = self._queue.get(timeout=_SECONDS_PER_LOOK)
             except queue.Empty:
                 continue
+            worker.asked = False
             request = {
+                "batch": worker.batch,
                 "directories": [str(directory) for directory in batch.directories],
                 "scenes": [dumps(scene) for scene in batch.scenes],
                 "device": worker.device,
@@ -241,6 +288,11 @@ class Pool:
                 outcomes = [["failed", worker.restart()]] * len(batch.members)
             elif outcomes is None:
                 outcomes = [[self._ending, ""]] * len(batch.members)
-            self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes], worker.reached))
-            worker.reached = 0.0
+            reached = worker.reached
+            if worker.asked and not self._ending:
+                outcomes = [[HANDED_BACK, ""] if own[0] == "terminated" else own for own in outcomes]
+                reached = 0.0  # those who take them up tell how far they are
+            worker.reached, worker.members_left, worker.seconds_left, worker.asked = 0.0, 0, 0.0, False
+            worker.batch = None
+            self._finished.put((batch, [Outcome(*outcome) for outcome in outcomes], reached))
             self._batch_ended.set()

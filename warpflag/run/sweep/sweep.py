@@ -23,7 +23,7 @@ from warpflag.run.stop import Ended, Stop
 from warpflag.run.sweep import batches, table
 from warpflag.run.sweep.batches import Batch
 from warpflag.run.sweep.plan import BASE_NAME, Member, Sweep, check_members, read
-from warpflag.run.sweep.pool import Pool
+from warpflag.run.sweep.pool import HANDED_BACK, Pool
 from warpflag.scene import SceneError
 from warpflag.scene.resistance import filament_mobility
 
@@ -170,12 +170,16 @@ class SweepRun:
                 while not pool.is_done:
                     pool.wait()
                     for batch, outcomes in pool.finished():
+                        left = [k for k, own in zip(batch.members, outcomes, strict=True) if own.status == HANDED_BACK]
+                        for part in self._cut(left, max(pool.idle, 1), pool.devices[0]):
+                            pool.submit(part)
                         for k, outcome in zip(batch.members, outcomes, strict=True):
-                            if outcome.status not in ("done", "interrupted", "terminated"):
+                            if outcome.status not in ("done", "interrupted", "terminated", HANDED_BACK):
                                 if outcome.status == "failed":
                                     failed[k] = outcome.message
                                 if not quiet:
                                     tell(f"{self.names[k]}: {outcome.message}")
+                    pool.balance()
                     progress.update(pool.reached)
                     if (now := monotonic()) > next_table:
                         self._write_table()
@@ -190,17 +194,23 @@ class SweepRun:
 
     def batches_for(self, pool: Pool, pending: list[int], quiet: bool) -> list[Batch]:
         """What the workers take: equal shares of the members that can advance together."""
-        workers, kind = len(pool.devices), "cuda" if pool.devices[0].startswith("cuda") else "cpu"
-        cut = [
-            own
-            for group in self._groups(pending)
-            for own in batches.cut(group, batches.share(len(group), workers, _LARGEST_BATCH[kind]))
-        ]
+        workers = len(pool.devices)
+        cut = self._cut(pending, workers, pool.devices[0])
         if not quiet and len(pending) > 1:
-            most = max(map(len, cut))
+            most = max(len(batch.members) for batch in cut)
             which = f"batches of {most}" if most > 1 else "one by one"
             on = f"{workers} worker{'s' if workers > 1 else ''} ({', '.join(dict.fromkeys(pool.devices))})"
             tell(f"{counted_members(len(pending))} on {on}, {which}")
+        return cut
+
+    def _cut(self, pending: list[int], workers: int, device: str) -> list[Batch]:
+        """Equal shares of the members that can advance together, for so many workers."""
+        largest = _LARGEST_BATCH["cuda" if device.startswith("cuda") else "cpu"]
+        cut = [
+            own
+            for group in self._groups(pending)
+            for own in batches.cut(group, batches.share(len(group), workers, largest))
+        ]
         return [Batch(own, [self._directory(k) for k in own], [self.members[k].scene for k in own]) for own in cut]
 
     def seconds_per_member(self, pending: Sequence[int], device: str | None, stop: Stop) -> float:

@@ -1,20 +1,24 @@
 """A worker of a sweep: a process that runs batches as they come on its standard input, and answers on its output.
 
-Requests and answers are JSON, one a line. A request is a batch: {"directories", "scenes" (TOML texts), "device",
-"options"}; {"measure": [TOML texts], "device", "quiet"} asks what a cell of these costs in a batch. Answers:
-{"reached"} while it runs [s], then {"outcomes": [[status, message], ...]}; or {"seconds"}. At the end of its input,
-also when the process that started it is gone, the worker ends its batch resumable.
+Requests and answers are JSON, one a line. A request is a batch: {"batch" (its number), "directories", "scenes" (TOML
+texts), "device", "options"}; {"measure": [TOML texts], "device", "quiet"} asks what a cell of these costs in a batch.
+Answers: {"reached" (simulated time [s]), "members_left", "seconds_left"} while it runs, then {"outcomes": [[status,
+message], ...]}; or {"seconds"}. {"hand_back": number} ends the batch of that number resumable, if it still runs; its
+members that are not done are then "terminated". At the end of its input, also when the process that started it is gone,
+the worker ends its batch resumable.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import signal
 import sys
 import threading
+from collections.abc import Callable, Collection
 from pathlib import Path
 from time import monotonic, perf_counter, process_time
 from typing import Any, TextIO
@@ -24,12 +28,13 @@ from warpflag.run.faults import NumericalError
 from warpflag.run.member import Outcome
 from warpflag.run.run_directory import SCENE_NAME
 from warpflag.run.simulation import Simulation
-from warpflag.run.stop import Stop
+from warpflag.run.stop import Ended, Stop
 from warpflag.scene import Scene, loads
 
 __all__ = ["main", "prepare"]
 
 _SECONDS_PER_REPORT = 0.2  # between two reports of the time reached: five a second
+_LEAST_SEEN = 1.0  # wall time [s] from which a worker tells how long its batch will take: the first steps are short
 _SAMPLE_SECONDS = 0.1  # of computing, which a sample takes at least: long enough to be timed to some per cent
 _FIRST_PART = 64  # the first sample is the simulated time over this; each further one is twice as long
 _loaded: set[str] = set()  # devices on which kernels were loaded before
@@ -55,11 +60,13 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what libraries print does not get between the answers
     requests: queue.Queue[dict[str, Any] | None] = queue.Queue()
-    threading.Thread(target=_listen, args=(sys.stdin, requests), daemon=True).start()
+    handed_back: set[int] = set()
+    threading.Thread(target=_listen, args=(sys.stdin, requests, handed_back), daemon=True).start()
     while (request := requests.get()) is not None:
         with Stop() as stop:
             try:
-                _answer(answers, _measured(request) if "measure" in request else _run(request, answers, stop))
+                measure = "measure" in request
+                _answer(answers, _measured(request) if measure else _run(request, answers, stop, handed_back))
             except KeyboardInterrupt:
                 return
             except (OSError, ValueError) as error:
@@ -67,9 +74,13 @@ def main() -> None:
                 _answer(answers, {"outcomes": [["failed", message]] * len(request.get("directories", [0]))})
 
 
-def _listen(stream: TextIO, requests: queue.Queue[dict[str, Any] | None]) -> None:
+def _listen(stream: TextIO, requests: queue.Queue[dict[str, Any] | None], handed_back: set[int]) -> None:
     for line in stream:
-        requests.put(json.loads(line))
+        request = json.loads(line)
+        if "hand_back" in request:
+            handed_back.add(request["hand_back"])
+        else:
+            requests.put(request)
     requests.put(None)
     os.kill(os.getpid(), signal.SIGTERM)  # ends what is running; without a run, the process
 
@@ -84,21 +95,54 @@ def _answer(answers: TextIO, answer: dict[str, Any]) -> None:
         os.close(nowhere)
 
 
-def _run(request: dict[str, Any], answers: TextIO, stop: Stop) -> dict[str, Any]:
+class _Reports:
+    """Says a few times a second how far a run is, and ends it when it is to be handed back.
+
+    Args:
+        answers: where it is said.
+        started: the run.
+        is_handed_back: whether it is to end.
+    """
+
+    def __init__(self, answers: TextIO, started: run.Run, is_handed_back: Callable[[], bool]) -> None:
+        self._answers, self._run, self._is_handed_back = answers, started, is_handed_back
+        self._reported, self._first = -math.inf, (0.0, 0.0)
+
+    def __call__(self, reached: float) -> None:
+        """Takes note of the simulated time that all members together have reached [s]."""
+        if self._is_handed_back():
+            raise Ended("terminated", "")
+        now = monotonic()
+        if self._reported == -math.inf:
+            self._first = (now, reached)
+        elif now - self._reported < _SECONDS_PER_REPORT:
+            return
+        self._reported = now
+        left = self._left()
+        report = {"reached": reached, "members_left": len(left), "seconds_left": self._seconds(now, reached, sum(left))}
+        _answer(self._answers, report)
+
+    def _left(self) -> list[float]:
+        """Simulated time that is left to each member that still goes on [s]."""
+        members, times = self._run.members, self._run.simulation.times
+        own = zip(members, times, strict=True)
+        return [max(m.scene.duration - float(time), 0.0) for m, time in own if m.outcome is None]
+
+    def _seconds(self, now: float, reached: float, left: float) -> float:
+        """Wall time that so much simulated time will take [s]; 0 while that is not known."""
+        seen, simulated = now - self._first[0], reached - self._first[1]
+        return left * seen / simulated if seen > _LEAST_SEEN and simulated > 0.0 else 0.0
+
+
+def _run(request: dict[str, Any], answers: TextIO, stop: Stop, handed_back: Collection[int]) -> dict[str, Any]:
     """Runs a batch; where it can't begin together, each member by itself."""
     directories = [Path(directory) for directory in request["directories"]]
     scenes = [loads(text) for text in request["scenes"]]
-    reported = monotonic()
-
-    def watch(reached: float) -> None:
-        nonlocal reported
-        if monotonic() - reported > _SECONDS_PER_REPORT:
-            reported = monotonic()
-            _answer(answers, {"reached": reached})
 
     def ended(batch: slice) -> list[Outcome]:
         started = _started(directories[batch], scenes[batch], request)
-        return started.execute_all(quiet=True, stop=stop, watch=watch)
+        reports = _Reports(answers, started, lambda: request["batch"] in handed_back)
+        return started.execute_all(quiet=True, stop=stop, watch=reports)
 
     try:
         outcomes = ended(slice(None))

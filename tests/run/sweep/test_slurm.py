@@ -16,7 +16,7 @@ from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
 from warpflag.run.sweep import Sweep, slurm
 
-PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
+PAGE = Path(__file__).parents[3] / "docs" / "sweeps.md"
 PATIENT = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(143)); time.sleep(60)"
 
 

@@ -1,6 +1,6 @@
 """A sweep on a real Slurm, by hand: starts one on the loopback of this machine, runs a sweep of eight, and stops it.
 
-    python tests/run/real_slurm.py [--script]
+    python tests/run/sweep/real_slurm.py [--script]
 
 Needs root, slurmctld, slurmd and munged (apt: slurm-wlm, munge), and submitit unless --script is given, which submits
 what `warpflag sweep --slurm-script` prints. The jobs have a minute each, which their members do not fit into, so that
@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 sys.path[:0] = [str(ROOT), str(ROOT / "kernels")]
 
 from tests.runs import assert_same_frames, small  # noqa: E402

@@ -301,7 +301,7 @@ def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
         """A worker that ends a batch at once."""
 
         def __init__(self, device, starter):
-            self.device, self.reached, self.thread = device, 0.0, None
+            self.device, self.reached, self.thread, self.batch, self.asked = device, 0.0, None, None, False
 
         def ask(self, request):
             self.reached = seen
@@ -332,11 +332,17 @@ def test_workers_end_as_the_sweep_does(status, number):
 
         def __init__(self, device, starter):
             self.device, self.reached, self.thread, self.process = device, 0.0, None, self
-            self.asked, self.ended, self.signals = threading.Event(), threading.Event(), []
+            self.batch, self.asked, self.begun, self.ended, self.signals = (
+                None,
+                False,
+                threading.Event(),
+                threading.Event(),
+                [],
+            )
             made.append(self)
 
         def ask(self, request):
-            self.asked.set()
+            self.begun.set()
             self.ended.wait(30.0)
             return {"outcomes": None}
 
@@ -350,7 +356,7 @@ def test_workers_end_as_the_sweep_does(status, number):
     with pool.Pool(["somewhere"], {}, worker=Running) as workers, Stop() as stop:
         workers.start(small(), stop)
         workers.submit(batches.Batch([0], [Path("0")], [small()]))
-        assert made[0].asked.wait(30.0)
+        assert made[0].begun.wait(30.0)
         workers.end(status)
         ((_, outcomes),) = workers.finished()
     assert made[0].signals == [number] and [outcome.status for outcome in outcomes] == [status]

@@ -1,0 +1,159 @@
+"""Batches that are handed back for idle workers: when, and that their members end as if they never were."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+
+from tests.runs import assert_same_frames, small, summary
+from warpflag.run import run, sweep
+from warpflag.run.stop import Stop
+from warpflag.run.sweep import Sweep, batches, pool
+from warpflag.scene import dumps
+
+
+class Scripted:
+    """A worker whose batches run until they are handed back or let go; of each the last member is then not done."""
+
+    def __init__(self, device, starter):
+        self.device, self.reached, self.members_left, self.seconds_left = device, 0.0, 0, 0.0
+        self.thread, self.batch, self.asked, self.process = None, None, False, SimpleNamespace(send_signal=self.let_go)
+        self.begun, self.ended, self.takes = threading.Event(), threading.Event(), []
+
+    def ask(self, request):
+        self.takes.append(request["directories"])
+        self.begun.set()
+        self.ended.wait(30.0)
+        self.ended.clear()
+        self.begun.clear()
+        last = "terminated" if self.asked else "done"
+        return {"outcomes": [["done", ""]] * (len(request["directories"]) - 1) + [[last, ""]]}
+
+    def hand_back(self):
+        self.asked = True
+        self.ended.set()
+
+    def let_go(self, _number=0):
+        self.ended.set()
+
+    def close(self):
+        self.ended.set()
+
+
+def batch(*members: int) -> batches.Batch:
+    return batches.Batch(members, [Path(str(k)) for k in members], [small()] * len(members))
+
+
+def until_idle(workers: pool.Pool, count: int) -> list:
+    """What has finished once so many workers have nothing to do."""
+    found = []
+    while workers.idle != count:
+        workers.wait()
+    while not (ended := workers.finished()):
+        workers.wait()
+    return found + ended
+
+
+def test_the_batch_that_ends_last_is_handed_back_where_it_is_worth_it():
+    made: list[Scripted] = []
+
+    def worker(device, starter):
+        made.append(Scripted(device, starter))
+        return made[-1]
+
+    with pool.Pool(["here", "there", "elsewhere"], {}, worker=worker) as workers, Stop() as stop:
+        workers.start(small(), stop)
+        for members in ((0, 1), (2, 3), (4, 5)):
+            workers.submit(batch(*members))
+        for own in made:
+            assert own.begun.wait(30.0)
+            own.members_left, own.seconds_left = 2, 3.0 * pool.WORTH_SHARING
+        workers.balance()
+        assert not any(own.asked for own in made)  # every worker has something to do
+        short, longer, longest = made
+        short.let_go()
+        assert [outcome.status for outcome in until_idle(workers, 1)[0][1]] == ["done", "done"]
+        longer.seconds_left, longest.seconds_left = 0.9 * pool.WORTH_SHARING, 0.5 * pool.WORTH_SHARING
+        workers.balance()
+        assert not any(own.asked for own in made)  # they end soon
+        longer.seconds_left = 2.0 * pool.WORTH_SHARING
+        longest.members_left, longest.seconds_left = 1, 9.0 * pool.WORTH_SHARING
+        workers.balance()  # a single member can't be shared
+        ((given, outcomes),) = until_idle(workers, 2)
+        assert given.directories == [Path(name) for name in longer.takes[0]]
+        assert [outcome.status for outcome in outcomes] == ["done", pool.HANDED_BACK]
+        assert not longer.asked and longer.members_left == 0 and not workers.is_done
+        workers.submit(batch(given.members[-1]))
+        while workers.idle != 1:
+            workers.wait()
+        for own in (short, longer, longest):
+            own.let_go()
+        while not workers.is_done:
+            workers.wait()
+            workers.finished()
+        taken = {tuple(names) for own in made for names in own.takes}
+        assert taken == {("0", "1"), ("2", "3"), ("4", "5"), (given.directories[-1].name,)}
+
+
+def test_members_that_are_handed_back_and_dealt_out_anew_end_as_in_one_process(tmp_path, monkeypatch):
+    asked = []
+    hand_back = pool.Worker.hand_back
+    monkeypatch.setattr(pool.Worker, "hand_back", lambda self: asked.append(self.members_left) or hand_back(self))
+    monkeypatch.setattr(pool, "WORTH_SHARING", -1.0)  # whatever it takes
+    axes = {"duration": [8e-3, 4e-5, 9e-3, 8e-5]}  # one worker gets the first and the third
+    base = small({"frames": 100})
+    outcome = sweep.start(Sweep(base, axes), str(tmp_path / "two")).execute(workers=2, quiet=True)
+    assert outcome.status == "done" and asked and set(asked) == {2}
+    monkeypatch.setattr(pool, "WORTH_SHARING", 1e9)
+    asked.clear()
+    assert sweep.start(Sweep(base, axes), str(tmp_path / "one")).execute(workers=1, quiet=True).status == "done"
+    assert not asked
+    assert (tmp_path / "two/table.csv").read_bytes() == (tmp_path / "one/table.csv").read_bytes()
+    for name in ("0000", "0002"):
+        assert_same_frames(tmp_path / "two" / name, tmp_path / "one" / name)
+
+
+def test_a_worker_hands_back_what_is_not_done_with_the_bits_of_single_runs(tmp_path):
+    scenes = [
+        small({"duration": d, "frames": 200, "motor.torque": t}) for d, t in ((8e-5, 2.0), (9e-3, 3.0), (8e-3, 1.0))
+    ]
+    directories = [tmp_path / f"{k}" for k in range(3)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "warpflag.run.sweep.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None and process.stdout is not None
+
+    def say(request) -> None:
+        process.stdin.write(json.dumps(request) + "\n")
+        process.stdin.flush()
+
+    def ended(members, batch) -> list[str]:
+        given = {"directories": [str(directories[k]) for k in members], "scenes": [dumps(scenes[k]) for k in members]}
+        options = {"strict": True, "movies": False, "checkpoint_seconds": None}
+        say({"batch": batch, "device": "cpu", "options": options, **given})
+        for line in process.stdout:
+            answer = json.loads(line)
+            if "outcomes" in answer:
+                return [status for status, _ in answer["outcomes"]]
+            assert 0 <= answer["members_left"] <= 3 and answer["seconds_left"] >= 0.0
+            if answer["members_left"] == 2 and batch == 1:
+                say({"hand_back": 7})  # another batch
+                say({"hand_back": 1})
+        raise AssertionError("the worker has ended")
+
+    assert ended((0, 1, 2), 1) == ["done", "terminated", "terminated"]
+    assert ended((1,), 2) == ["done"]
+    assert ended((2,), 3) == ["done"]
+    process.stdin.close()
+    process.wait()
+    process.stdout.close()
+    for scene, directory in zip(scenes, directories, strict=True):
+        alone = tmp_path / f"alone-{directory.name}"
+        run.start_batch([scene], [alone], "cpu", strict=True, movies=False).execute_all(quiet=True)
+        assert_same_frames(alone, directory)
+        for name in ("steps", "rejected_steps", "evaluations", "observables", "rates", "accuracy"):
+            assert summary(alone)[name] == summary(directory)[name]
