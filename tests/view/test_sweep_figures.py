@@ -67,6 +67,27 @@ def test_a_second_axis_makes_a_line_each(grid):
     assert [text.get_text() for text in panel.get_legend().get_texts()] == ["mode none", "mode all", "mode within"]
 
 
+def test_an_axis_of_words_has_a_place_for_each(tmp_path):
+    rows = ["0,0,0,rate,True,done,10", "1,1,0,rate,False,done,14", "2,2,0,constant,True,done,20"]
+    made = sweep(tmp_path / "w", {"motor.law": ["rate", "constant"], "a.on": ["x"]}, rows, "rates.net_speed")
+    (panel,) = sweep_figures.curves(sweep_figures.read(made)).axes
+    assert [container[0].get_xydata().tolist() for container in panel.containers] == [[[0, 10], [1, 20]], [[0, 14]]]
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["rate", "constant"]
+    (panel,) = sweep_figures.curves(sweep_figures.read(made), "a.on").axes
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["True", "False"]
+
+
+def test_a_mean_over_a_third_axis_says_so(tmp_path):
+    values = [(a, b, c) for a in (1, 2, 3) for b in (1, 2, 3) for c in (44, 90)]
+    rows = [f"{k},{k},0,{a},{b},{c},done,{a + b + c}" for k, (a, b, c) in enumerate(values)]
+    axes = {"motor.torque": [1, 2, 3], "fluid.viscosity": [1, 2, 3], "flagella.opening_angle": [44, 90]}
+    table = sweep_figures.read(sweep(tmp_path / "three", axes, rows, "rates.net_speed"))
+    for figure in (sweep_figures.curves(table), sweep_figures.maps(table)):
+        assert figure.get_supxlabel() == "means over flagella opening angle [deg]"
+    (panel,) = sweep_figures.curves(table).axes
+    assert panel.containers[0][0].get_ydata().tolist() == [69, 70, 71]
+
+
 def test_points_that_are_not_what_they_say_are_hollow(tmp_path):
     """Rates of cells that had not zipped when their window began; zip times that not every repeat reached."""
     rows = ["0,0,0,1.0,done,10,0.010,0.004", "1,0,1,1.0,done,14,0.010,0.006", "2,1,0,2.0,done,20,0.010,0.012"]

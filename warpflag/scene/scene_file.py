@@ -43,7 +43,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         mode = path.stat().st_mode  # before it is opened: a pipe would wait for its writer
         if stat.S_ISDIR(mode):
-            problem = "can't be read: it is a directory"
+            inside = path / "scene.toml"  # of a run
+            problem = "can't be read: it is a directory" + (f"; did you mean {inside}?" if inside.is_file() else "")
         elif not stat.S_ISREG(mode):
             problem = "can't be read: it is not a regular file"
         else:

@@ -103,6 +103,14 @@ class Table:
             return np.ones(len(zipped), dtype=bool)
         return np.isfinite(self.numbers(name))
 
+    def positions(self, name: str) -> tuple[Array, list[str]]:
+        """Where each row stands along a column, and the words that stand there: none where it holds numbers."""
+        try:
+            return self.numbers(name), []
+        except OutputError:
+            words, position = self.levels(name)
+            return position.astype(float), words
+
     def levels(self, name: str) -> tuple[list[str], Array]:
         """Values of an axis as text, each once in order of size, and which of them each row has."""
         texts = self.columns[name]
@@ -185,6 +193,8 @@ def _style() -> Iterator[None]:
 def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> Figure:
     """A panel per number against one column; mean and standard error where rows share it; a line per second axis.
 
+    A column of words has a place for each. What is a mean over further axes says so.
+
     A point is hollow where it does not stand for all that its name says: see `Table.whole`.
 
     Args:
@@ -196,7 +206,7 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
         OutputError: there is no such column, or none with anything to draw.
     """
     x, numbers = _abscissa(table, x), _drawn(table, numbers)
-    position, others = table.numbers(x), [axis for axis in table.axes if axis != x]
+    (position, words), others = table.positions(x), [axis for axis in table.axes if axis != x]
     lines, line_of = table.levels(others[0]) if others else ([""], np.zeros(len(position), dtype=int))
     from matplotlib.lines import Line2D
 
@@ -222,13 +232,26 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
         panel.set_xlabel(_label(x))
         panel.set_ylabel(_label(name))
         panel.set_xlim(*_with_margin(position))
+        if words:
+            panel.set_xticks(range(len(words)), [_short(word) for word in words])
     if others:
         handles = [Line2D([], [], marker="o", markersize=3.5, color=COLORS[k % len(COLORS)]) for k in range(len(lines))]
         labels = [f"{_leaf(others[0])} {_short(line)}".replace("_", " ") for line in lines]
         panels[0].legend(handles, labels)
-    if notes:
-        figure.supxlabel("hollow: " + "; ".join(notes), fontsize=7)
+    _say(figure, _over(table, others[1:]), "hollow: " + "; ".join(notes) if notes else "")
     return figure
+
+
+def _over(table: Table, axes: Sequence[str]) -> str:
+    """What a figure says of axes that it does not show; empty where they have one value each."""
+    found = [_label(axis) for axis in axes if len(set(table.columns[axis])) > 1]
+    return "means over " + " and ".join(found) if found else ""
+
+
+def _say(figure: Figure, *notes: str) -> None:
+    """Notes below a figure, where there are any."""
+    if any(notes):
+        figure.supxlabel("; ".join(filter(None, notes)), fontsize=7)
 
 
 def _with_margin(position: Array) -> tuple[float, float]:
@@ -273,6 +296,7 @@ def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
             labels([_short(level) for level in levels[::every]])
         panel.set_xlabel(_label(table.axes[0]))
         panel.set_ylabel(_label(table.axes[1]))
+    _say(figure, _over(table, table.axes[2:]))
     return figure
 
 

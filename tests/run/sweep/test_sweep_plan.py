@@ -6,18 +6,14 @@ import csv
 import json
 import math
 import re
-import signal
-import threading
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.runs import small
 from warpflag.model.geometry import initial_state
-from warpflag.run.stop import Stop
-from warpflag.run.sweep import BadMembers, Sweep, batches, grid_axes, pool, read, resume, start, table
+from warpflag.run.sweep import BadMembers, Sweep, grid_axes, read, resume, start, table
 from warpflag.scene import SceneError, dumps, load, with_values
 
 
@@ -198,11 +194,51 @@ def test_what_is_no_sweep_is_one_line(text, words, folder):
 
 
 @pytest.mark.parametrize(
-    "argument", ["motor.torque", "motor.torque=", "motor.torque=1:2:x", "motor.torque=1:2:0", "=1:2:3"]
+    "argument",
+    [
+        *("motor.torque", "motor.torque=", "motor.torque=1:2:x", "motor.torque=1:2:0", "=1:2:3"),
+        *("motor.torque=1:2:3:exp", "motor.torque=0:2:3:log", "motor.torque=1:2:3:log:4"),
+    ],
 )
 def test_a_malformed_grid_is_refused(argument):
     with pytest.raises(SceneError, match="--grid"):
         grid_axes([argument])
+
+
+def test_a_logarithmic_axis_has_equal_ratios(folder):
+    text = "[axes]\nfluid.viscosity = { from = 1e-3, to = 8e-3, count = 4, spacing = 'log' }\n"
+    found = [member.scene.fluid.viscosity for member in members(folder, text)]
+    np.testing.assert_allclose(found, [1e-3, 2e-3, 4e-3, 8e-3], rtol=1e-12)
+    assert (found[0], found[-1]) == (1e-3, 8e-3)
+    assert grid_axes(["fluid.viscosity=1e-3:8e-3:4:log"]) == {"fluid.viscosity": found}
+    linear = "[axes]\nfluid.viscosity = { from = 1e-3, to = 8e-3, count = 2, spacing = 'linear' }\n"
+    assert [member.scene.fluid.viscosity for member in members(folder, linear)] == [1e-3, 8e-3]
+
+
+@pytest.mark.parametrize(
+    "section, key", [("fluid.temperature = 298.0", "fluid"), ("motor.switching = 'markov'", "motor")]
+)
+def test_every_repeat_tells_its_seed(section, key, folder):
+    text = f"repeats = 3\n[set]\n{section}\n{key}.seed = 7\n[axes]\nmotor.torque = [1.0, 2.0]\n"
+    found = members(folder, text)
+    seeds = [member.values[f"{key}.seed"] for member in found]
+    assert seeds == [getattr(member.scene, key).seed for member in found]
+    assert seeds[0] == 7 and len(set(seeds[:3])) == 3 and seeds[3:] == seeds[:3]
+
+
+def test_every_line_names_its_member(folder):
+    with pytest.raises(BadMembers) as refused:
+        members(folder, "[axes]\nmotor.torque = [1.0, 5e3]\nfluid.viscosity = [1e-3, -1.0]\n")
+    lines = str(refused.value).splitlines()
+    assert [line.partition(": ")[0] for line in lines] == ["member 0001 and 1 more", "member 0002 and 1 more"]
+
+
+def test_a_base_that_is_a_run_names_its_scene(folder):
+    (folder / "run").mkdir()
+    (folder / "run" / "scene.toml").write_text(dumps(small()))
+    (folder / "of_run.toml").write_text('base = "run"\n[axes]\nmotor.torque = [1.0]\n')
+    with pytest.raises(SceneError, match=r"is a directory; did you mean .*run/scene\.toml\?"):
+        read(folder / "of_run.toml")
 
 
 def test_an_axis_of_vectors_on_the_command_line_and_one_given_twice():
@@ -291,75 +327,6 @@ def test_of_many_bad_members_the_first_are_named(folder):
     with pytest.raises(BadMembers, match="and 80 more members") as refused:
         members(folder, "[axes]\nmotor.torque = {from = 2e4, to = 3e4, count = 100}\n")
     assert len(str(refused.value).splitlines()) == 21
-
-
-@pytest.mark.parametrize(("seen", "expected"), [(0.0, 8e-5), (5e-5, 8e-5), (1.2e-4, 1.2e-4)])
-def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
-    """Whatever their worker last said of a batch: one is done, the other was stopped."""
-
-    class Instant:
-        """A worker that ends a batch at once."""
-
-        def __init__(self, device, starter):
-            self.device, self.reached, self.thread, self.batch, self.asked = device, 0.0, None, None, False
-
-        def ask(self, request):
-            self.reached = seen
-            return {"outcomes": [["done", ""], ["stopped", "by a guard"]]}
-
-        def close(self):
-            pass
-
-    scenes = [small(), small()]
-    with pool.Pool(["somewhere"], {}, worker=Instant) as workers, Stop() as stop:
-        workers.start(scenes[0], stop)
-        workers.submit(batches.Batch([0, 1], [Path("0"), Path("1")], scenes))
-        ended = []
-        while not workers.is_done:
-            workers.wait()
-            ended += workers.finished()
-        assert [outcome.status for outcome in ended[0][1]] == ["done", "stopped"]
-        assert workers.reached == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("status", "number"), [("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)])
-def test_workers_end_as_the_sweep_does(status, number):
-    """By the signal that makes their members say the same."""
-    made = []
-
-    class Running:
-        """A worker that runs a batch until it gets a signal."""
-
-        def __init__(self, device, starter):
-            self.device, self.reached, self.thread, self.process = device, 0.0, None, self
-            self.batch, self.asked, self.begun, self.ended, self.signals = (
-                None,
-                False,
-                threading.Event(),
-                threading.Event(),
-                [],
-            )
-            made.append(self)
-
-        def ask(self, request):
-            self.begun.set()
-            self.ended.wait(30.0)
-            return {"outcomes": None}
-
-        def send_signal(self, number):
-            self.signals.append(number)
-            self.ended.set()
-
-        def close(self):
-            pass
-
-    with pool.Pool(["somewhere"], {}, worker=Running) as workers, Stop() as stop:
-        workers.start(small(), stop)
-        workers.submit(batches.Batch([0], [Path("0")], [small()]))
-        assert made[0].begun.wait(30.0)
-        workers.end(status)
-        ((_, outcomes),) = workers.finished()
-    assert made[0].signals == [number] and [outcome.status for outcome in outcomes] == [status]
 
 
 def test_means_are_of_the_repeats_that_are_done(tmp_path):

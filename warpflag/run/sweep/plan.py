@@ -9,7 +9,7 @@ A sweep file:
     duration = 0.01
 
     [axes]                                # all combinations
-    motor.torque = { from = 0.4, to = 3.4, count = 8 }
+    motor.torque = { from = 0.4, to = 3.4, count = 8 }    # spacing = "log": equal ratios
     flagella.opening_angle = [23, 44, 90]
 
     [random]
@@ -26,7 +26,7 @@ import contextlib
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +61,15 @@ def check_members(bad: Mapping[str, SceneError]) -> None:
     """
     members: dict[str, list[str]] = {}
     for name, error in bad.items():
-        members.setdefault(str(error), []).append(name)
+        for problem in str(error).splitlines():
+            members.setdefault(problem, []).append(name)
     lines = [
         f"{own[0]}{f' and {len(own) - 1} more' if len(own) > 1 else ''}: {problem}" for problem, own in members.items()
     ]
     if len(lines) > MOST_PROBLEMS:
-        left = list(members.values())[MOST_PROBLEMS:]
-        lines[MOST_PROBLEMS:] = [f"and {sum(map(len, left))} more members"]
+        named = set(itertools.chain(*list(members.values())[:MOST_PROBLEMS]))
+        left = len(bad.keys() - named)
+        lines[MOST_PROBLEMS:] = [f"and {left} more members" if left else "and more of the same members"]
     if lines:
         raise BadMembers("\n".join(lines))
 
@@ -97,8 +99,8 @@ class Sweep:
 
     Attributes:
         base: the scene that all members share but for their values.
-        axes: values by dotted key, or from, to and count; the members are all combinations, the last axis fastest.
-            None takes a value of the base away. What is given as arrays of NumPy is kept as lists.
+        axes: values by dotted key, or from, to, count and spacing; the members are all combinations, the last axis
+            fastest. None takes a value of the base away. What is given as arrays of NumPy is kept as lists.
         random: as the table [random] of a sweep file, dotted keys flat.
         repeats: of every combination and draw.
         name: of the sweep's directory; empty: that of the base.
@@ -161,7 +163,7 @@ class Sweep:
                     continue
                 members.append(Member(int(number), point, repeat, values, scene))
         check_members(bad)
-        return members
+        return _with_seeds(members)
 
     def _varied(
         self, random: draws.Draws, combination: Sequence[Any], draw: int, repeat: int, name: str
@@ -240,7 +242,7 @@ def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes:
 
 
 def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
-    """Axes from the command line: "key=from:to:count", or "key=a,b,c".
+    """Axes from the command line: "key=from:to:count", "key=from:to:count:log", or "key=a,b,c".
 
     Raises:
         SceneError: an argument has another form.
@@ -250,10 +252,11 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
         key, sign, text = argument.partition("=")
         parts = text.split(":")
         try:
-            if not sign or not key or len(parts) not in (1, 3):
+            if not sign or not key or len(parts) not in (1, 3, 4):
                 raise ValueError
-            if len(parts) == 3:
+            if len(parts) > 1:
                 table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
+                table |= {"spacing": parts[3]} if len(parts) == 4 else {}
                 found = _axis(key, table)
             else:
                 items = filter(None, _OUTER_COMMA.split(text))
@@ -261,7 +264,7 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
         except ValueError as error:
             if isinstance(error, SceneError):
                 raise error.located("--grid") from None
-            problem = "must be written key=from:to:count or key=a,b,c"
+            problem = "must be written key=from:to:count, key=from:to:count:log or key=a,b,c"
             raise SceneError(key, text, problem, source="--grid") from None
         if not found:
             raise SceneError(key, text, "has no values", source="--grid")
@@ -272,14 +275,28 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
 
 
 def _axis(key: str, values: Any) -> list[Any]:
-    """The values of an axis: a list, or from, to and count."""
+    """The values of an axis: a list, or from, to, count and perhaps spacing."""
     if isinstance(values, list) and values:
         return values
-    if isinstance(values, dict) and values.keys() == {"from", "to", "count"}:
-        ends = [values["from"], values["to"]]
+    if isinstance(values, dict) and values.keys() | {"spacing"} == {"from", "to", "count", "spacing"}:
+        ends, spacing = [values["from"], values["to"]], values.get("spacing", "linear")
+        if spacing not in ("linear", "log"):
+            raise SceneError(f"{key}.spacing", spacing, "must be one of linear, log")
         if all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
-            return [float(value) for value in np.linspace(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
+            if spacing == "log" and min(ends) <= 0.0:
+                raise SceneError(key, values, "must have from and to above 0 where spacing is log")
+            spaced = np.geomspace if spacing == "log" else np.linspace
+            return [float(value) for value in spaced(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
     raise SceneError(key, values, "must be a list of values, or { from = , to = , count = }")
+
+
+def _with_seeds(members: list[Member]) -> list[Member]:
+    """Members that all tell their seed where some have drawn one: the first repeat has that of its scene."""
+    seeds = {"fluid.seed": lambda scene: scene.fluid.seed, "motor.seed": lambda scene: scene.motor.seed}
+    for key, seed in seeds.items():
+        if any(key in member.values for member in members):
+            members = [replace(own, values={**own.values, key: seed(own.scene)}) for own in members]
+    return members
 
 
 def _plain(value: Any) -> Any:

@@ -1,13 +1,16 @@
-"""Batches that are handed back for idle workers: when, and that their members end as if they never were."""
+"""The workers of a sweep: how they end, and batches that they hand back so that idle ones can share them."""
 
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
+
+import pytest
 
 from tests.runs import assert_same_frames, small, summary
 from warpflag.run import run, sweep
@@ -157,3 +160,72 @@ def test_a_worker_hands_back_what_is_not_done_with_the_bits_of_single_runs(tmp_p
         assert_same_frames(alone, directory)
         for name in ("steps", "rejected_steps", "evaluations", "observables", "rates", "accuracy"):
             assert summary(alone)[name] == summary(directory)[name]
+
+
+@pytest.mark.parametrize(("seen", "expected"), [(0.0, 8e-5), (5e-5, 8e-5), (1.2e-4, 1.2e-4)])
+def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
+    """Whatever their worker last said of a batch: one is done, the other was stopped."""
+
+    class Instant:
+        """A worker that ends a batch at once."""
+
+        def __init__(self, device, starter):
+            self.device, self.reached, self.thread, self.batch, self.asked = device, 0.0, None, None, False
+
+        def ask(self, request):
+            self.reached = seen
+            return {"outcomes": [["done", ""], ["stopped", "by a guard"]]}
+
+        def close(self):
+            pass
+
+    scenes = [small(), small()]
+    with pool.Pool(["somewhere"], {}, worker=Instant) as workers, Stop() as stop:
+        workers.start(scenes[0], stop)
+        workers.submit(batches.Batch([0, 1], [Path("0"), Path("1")], scenes))
+        ended = []
+        while not workers.is_done:
+            workers.wait()
+            ended += workers.finished()
+        assert [outcome.status for outcome in ended[0][1]] == ["done", "stopped"]
+        assert workers.reached == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("status", "number"), [("interrupted", signal.SIGINT), ("terminated", signal.SIGTERM)])
+def test_workers_end_as_the_sweep_does(status, number):
+    """By the signal that makes their members say the same."""
+    made = []
+
+    class Running:
+        """A worker that runs a batch until it gets a signal."""
+
+        def __init__(self, device, starter):
+            self.device, self.reached, self.thread, self.process = device, 0.0, None, self
+            self.batch, self.asked, self.begun, self.ended, self.signals = (
+                None,
+                False,
+                threading.Event(),
+                threading.Event(),
+                [],
+            )
+            made.append(self)
+
+        def ask(self, request):
+            self.begun.set()
+            self.ended.wait(30.0)
+            return {"outcomes": None}
+
+        def send_signal(self, number):
+            self.signals.append(number)
+            self.ended.set()
+
+        def close(self):
+            pass
+
+    with pool.Pool(["somewhere"], {}, worker=Running) as workers, Stop() as stop:
+        workers.start(small(), stop)
+        workers.submit(batches.Batch([0], [Path("0")], [small()]))
+        assert made[0].begun.wait(30.0)
+        workers.end(status)
+        ((_, outcomes),) = workers.finished()
+    assert made[0].signals == [number] and [outcome.status for outcome in outcomes] == [status]
