@@ -75,6 +75,15 @@ def test_an_axis_of_words_has_a_place_for_each(tmp_path):
     assert [text.get_text() for text in panel.get_xticklabels()] == ["rate", "constant"]
     (panel,) = sweep_figures.curves(sweep_figures.read(made), "a.on").axes
     assert [text.get_text() for text in panel.get_xticklabels()] == ["True", "False"]
+    assert panel.containers[0][0].get_linestyle() == "None"  # there is nothing between two words
+
+
+@pytest.mark.parametrize(("values", "scale"), [((1, 2, 4), "log"), ((1, 2, 3), "linear"), ((1, 4), "linear")])
+def test_an_axis_of_equal_ratios_is_drawn_as_one(values, scale, tmp_path):
+    rows = [f"{k},{k},0,{value},done,{k}" for k, value in enumerate(values)]
+    made = sweep(tmp_path / "ratios", {"motor.torque": list(values)}, rows, "rates.net_speed")
+    (panel,) = sweep_figures.curves(sweep_figures.read(made)).axes
+    assert panel.get_xscale() == scale and panel.get_xlim()[0] < values[0] < values[-1] < panel.get_xlim()[1]
 
 
 def test_a_mean_over_a_third_axis_says_so(tmp_path):
@@ -132,6 +141,14 @@ def test_what_cannot_be_drawn_is_one_line(arguments, words, line, capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and all(word in said for word in words), said
     assert not (line / "x.png").exists()
+
+
+def test_a_table_without_the_usual_numbers_names_those_it_has(tmp_path, capsys):
+    made = sweep(tmp_path / "short", {"motor.torque": [1.0]}, ["0,0,0,1.0,done,3"], "observables.motor_rate")
+    assert cli.main(["plot", str(made), "-o", str(tmp_path / "x.png")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "--y" in said and "observables.motor_rate" in said
+    assert cli.main(["plot", str(made), "-o", str(tmp_path / "x.png"), "--y", "motor_rate"]) == 0
 
 
 def test_the_command_draws_what_it_was_asked_for(line, grid, tmp_path, capsys):

@@ -74,6 +74,11 @@ class Table:
             raise OutputError(f"{self.name}: column {name} does not hold numbers") from None
         return np.where(np.isfinite(found), found, math.nan)
 
+    @property
+    def known(self) -> list[str]:
+        """Columns that a figure may be asked for by name: those of single flagella and of the bookkeeping left out."""
+        return [column for column in self.columns if column not in _BEFORE_NUMBERS and not column[-1].isdecimal()]
+
     def full_name(self, name: str) -> str:
         """The column of a name, which may be the last part of one alone: net_speed for rates.net_speed.
 
@@ -82,7 +87,7 @@ class Table:
         """
         if name in self.columns:
             return name
-        known = [column for column in self.columns if column not in _BEFORE_NUMBERS and not column[-1].isdecimal()]
+        known = self.known
         ending = [column for column in known if column.endswith(f".{name}")]
         if len(ending) == 1:
             return ending[0]
@@ -221,7 +226,7 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
             means = np.array([row.mean() if len(row) else math.nan for row in rows])
             errors = [row.std(ddof=1) / math.sqrt(len(row)) if len(row) > 1 else 0.0 for row in rows]
             color = COLORS[k % len(COLORS)]
-            panel.errorbar(places, means, errors, capsize=2, color=color)
+            panel.errorbar(places, means, errors, capsize=2, color=color, linestyle="none" if words else "-")
             full = np.array([bool(whole[at].all()) for at in here])
             panel.plot(places[full], means[full], "o", markersize=3.5, color=color)
             hollow = ~full & np.isfinite(means)
@@ -231,9 +236,13 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
                 notes["not bundled when the window of rates began" if rate else "not reached by every repeat"] = None
         panel.set_xlabel(_label(x))
         panel.set_ylabel(_label(name))
-        panel.set_xlim(*_with_margin(position))
         if words:
             panel.set_xticks(range(len(words)), [_short(word) for word in words])
+        elif _in_equal_ratios(position):
+            panel.set_xscale("log")
+        else:
+            panel.ticklabel_format(axis="x", scilimits=(-2, 5), useMathText=True)
+        panel.set_xlim(*_with_margin(position, panel.get_xscale() == "log"))
     if others:
         handles = [Line2D([], [], marker="o", markersize=3.5, color=COLORS[k % len(COLORS)]) for k in range(len(lines))]
         labels = [f"{_leaf(others[0])} {_short(line)}".replace("_", " ") for line in lines]
@@ -254,11 +263,23 @@ def _say(figure: Figure, *notes: str) -> None:
         figure.supxlabel("; ".join(filter(None, notes)), fontsize=7)
 
 
-def _with_margin(position: Array) -> tuple[float, float]:
+def _with_margin(position: Array, logarithmic: bool) -> tuple[float, float]:
     """The range of an abscissa, the same in every panel, with room for the markers."""
     low, high = float(np.nanmin(position)), float(np.nanmax(position))
+    if logarithmic:
+        room = (high / low) ** 0.04
+        return low / room, high * room
     room = 0.04 * (high - low) or 0.5
     return low - room, high + room
+
+
+def _in_equal_ratios(position: Array) -> bool:
+    """Whether the values of an abscissa, three at least, are spaced as those of a logarithmic axis."""
+    places = np.unique(position[np.isfinite(position)])
+    if len(places) < 3 or places[0] <= 0.0:
+        return False
+    ratios = np.diff(np.log(places))
+    return bool(np.ptp(ratios) < 1e-6 * ratios.mean())
 
 
 @_style()
@@ -311,6 +332,10 @@ def _drawn(table: Table, numbers: Sequence[str]) -> list[str]:
     if numbers:
         return [table.full_name(name) for name in numbers]
     found = [name for name in DEFAULT_NUMBERS if name in table.columns and np.isfinite(table.numbers(name)).any()]
+    if not found and "done" in table.columns.get("status", ()):
+        named = ", ".join(map(_leaf, DEFAULT_NUMBERS))
+        known = ", ".join(table.known)
+        raise OutputError(f"{table.name}: holds none of {named}; name what to draw with --y: it has {known}")
     if not found:
         raise OutputError(f"{table.name}: no member has anything to draw yet")
     return found
