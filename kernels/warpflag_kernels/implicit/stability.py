@@ -4,7 +4,7 @@ The matrix of a step holds the local mobility alone. Under the full mobility M a
 as with the local one, since filaments side by side drag each other along. With the stiffness weighted by the
 over-implicitness w, a step of two iterations multiplies such a mode by (1 - kappa/w)^2, so w must exceed kappa/2.
 kappa is the largest eigenvalue of w P (1/dt + g M H), P the inverse of the matrix. A power iteration follows it: one
-product every few steps, applied to a vector, the probe, that is kept from one measurement to the next.
+product every few steps, applied to a vector, the probe, that is kept in between and turns with the flagella meanwhile.
 
 kappa is taken to be the growth of the probe's length. The product is not symmetric, so that may exceed the eigenvalue;
 it tells of modes that two iterations would magnify at first. One or two flexible flagella need little more than the
@@ -31,7 +31,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body
 from warpflag_kernels.implicit import block_band, linearised
-from warpflag_kernels.rod import chain_chart
+from warpflag_kernels.rod import chain_chart, kept_increment
 
 LEAST_OVER_IMPLICIT = 1.3  # least over-implicitness, enough for kappa up to 2.6
 OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
@@ -40,10 +40,8 @@ LARGEST_FALL = 0.985
 MOST_OVER_IMPLICIT = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST_OVER_IMPLICIT, the limit of stability: from there on the full mobility is solved with
-# The same for flexible cells, whose kappa is a growth: readings up to 13 amid contacts are of sound steps.
-LARGE_KAPPA_OF_FLEXIBLE = 15.0
-# First root of cosh q cos q = 1: a free rod's slowest bending mode decays at A q^4/(gamma_perp L^4).
-FREE_ROD = 4.730041
+LARGE_KAPPA_OF_FLEXIBLE = 15.0  # the same for flexible cells: growths up to 13 amid contacts are of sound steps
+FREE_ROD = 4.730041  # first root of cosh q cos q = 1: a free rod's slowest bending decays at A q^4/(gamma_perp L^4)
 RELAXED = 0.1  # decay times of that mode in a step from which a cell counts as stiff
 # Decay times of the longest stretching mode, at K pi^2/(gamma_par L^2), in the longest step, from which a cell counts
 # as stiff: two flagella of the default stiffness go through five.
@@ -51,6 +49,8 @@ TIGHT = 10.0
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
 LONG_INTERVAL = 32  # the same for one or two flexible flagella of small kappa
 FIRST_OF_FLEXIBLE = 8  # step after a start at which those are first measured
+FINE_INTERVAL = 8  # the same for those of fine meshes: it takes some twenty products to find a mode of large kappa
+FINE = 0.15  # segments shorter than this make a fine mesh [um]: one flagellum has kappa 1.5, 2.0, 2.7 at 0.2, 0.1, 0.05
 
 
 @functools.cache
@@ -62,9 +62,10 @@ def struct(p: Precision) -> Any:
     class Stability:
         kappa: wp.array(dtype=wp.float64)
         measured: wp.array(dtype=wp.int32)  # 1: the cell is measured in this pass
+        interval: wp.array(dtype=wp.int32)  # steps between two measurements of one or two flexible flagella
         active: wp.array(dtype=wp.int32)  # copy of `State.active`, which is masked during a measurement
         due: wp.array(dtype=wp.int32)  # [1], 1: some cell is measured in this pass
-        probe: Increment  # of the power iteration, unit length
+        probe: Increment  # of the power iteration, unit length, as `kept_increment` keeps it
         strong: wp.array(dtype=wp.int32)  # 1: kappa is large, the equations are solved with the full mobility
         any_strong: wp.array(dtype=wp.int32)  # [1], 1: some cell's is
         size: wp.array(dtype=wp.float64)  # [K], squared length of the flagellum's part of a product
@@ -91,7 +92,10 @@ def allocate(model: DeviceModel) -> Any:
     s.measured, s.active, s.strong = (wp.zeros(cells, dtype=wp.int32, device=device) for _ in range(3))
     # Conditional kernels load in the first pass, which takes no step.
     s.due, s.any_strong = (wp.ones(1, dtype=wp.int32, device=device) for _ in range(2))
-    nodes = np.diff(model.data.first_node.numpy()[model.data.first_flagellum.numpy()])
+    first = model.data.first_flagellum.numpy()
+    fine = np.minimum.reduceat(model.data.rod.segment_length.numpy(), first[:-1]) < FINE
+    s.interval = wp.array(np.where(fine, FINE_INTERVAL, LONG_INTERVAL), dtype=wp.int32, device=device)
+    nodes = np.diff(model.data.first_node.numpy()[first])
     bending, stretching = _relaxation_rates(model)
     s.bending_rate = wp.array(bending, dtype=wp.float64, device=device)
     s.stretching_rate = wp.array(stretching, dtype=wp.float64, device=device)
@@ -104,8 +108,7 @@ def allocate(model: DeviceModel) -> Any:
 def _relaxation_rates(model: DeviceModel) -> tuple[np.ndarray, np.ndarray]:
     """Rates at which the longest bending and stretching modes relax, the largest of a cell's flagella [1/s], shape [C].
 
-    With the local mobility: A q^4 mu_across per length with q L the first root `FREE_ROD`, and K (pi/L)^2 mu_along of a
-    half wave.
+    With the local mobility: A q^4 mu_across per length, q L the root `FREE_ROD`; K (pi/L)^2 mu_along of a half wave.
     """
     first_node, first_flagellum = model.data.first_node.numpy(), model.data.first_flagellum.numpy()[:-1]
     rod, drag, first = model.data.rod, model.data.drag, first_node[:-1] + 1
@@ -119,12 +122,12 @@ def _relaxation_rates(model: DeviceModel) -> tuple[np.ndarray, np.ndarray]:
 @functools.cache
 def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     """The kernels; those of cells with flow round their bodies, or without."""
-    real, vec3, respond = p.real, p.vec3, body.mobility(p).respond
+    real, vec3, vec4, respond = p.real, p.vec3, p.vec4, body.mobility(p).respond
     Band = block_band.types(p).Band
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability", "body_flow" if body_flow else "")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
-    long_interval, first_of_flexible = wp.constant(LONG_INTERVAL), wp.constant(FIRST_OF_FLEXIBLE)
+    first_of_flexible = wp.constant(FIRST_OF_FLEXIBLE)
     large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
     large_kappa_of_stiff = wp.constant(wp.float64(0.0 if body_flow else LARGE_KAPPA))
     tight, relaxed = wp.constant(wp.float64(TIGHT)), wp.constant(wp.float64(RELAXED))
@@ -159,7 +162,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         measured = int(0)
         due = accepted[c] == 0
         if weakly_coupled(model, stability, c, longest_step[c]) and stability.kappa[c] <= large_kappa:
-            due = due or steps[c] % long_interval == first_of_flexible
+            due = due or steps[c] % stability.interval[c] == first_of_flexible % stability.interval[c]
         else:
             due = due or steps[c] < first_measurements or steps[c] % interval == 0
         if state.active[c] != 0 and due:
@@ -254,8 +257,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         local += wp.float64(wp.dot(force, velocity) + wp.dot(torque, spin))
         dt = step[c]
         w = over_implicit[c]
-        # In soft modes of a filament under load x.H x may be negative: then it says nothing of the stiffness.
-        stability.quotient[c] = w
+        stability.quotient[c] = w  # soft modes under load, whose x.H x may be negative, say nothing of the stiffness
         denominator = stored / dt + w * gain[c] * local
         if denominator > wp.float64(0.0):
             stability.quotient[c] = w * (stored / dt + gain[c] * full) / denominator
@@ -279,9 +281,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         while e < model.first_node[k + 1]:
             d = response.node[e]
             if e == first:
-                d[0] = real(0.0)  # r_0 has no displacement of its own
-                d[1] = real(0.0)
-                d[2] = real(0.0)
+                d = vec4(real(0.0), real(0.0), real(0.0), d[3])  # r_0 has no displacement of its own
             stability.probe.node[e] = d
             x = scale * scale * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
             total += wp.float64(x + d[3] * d[3])
@@ -316,8 +316,8 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             weak = weakly_coupled(model, stability, c, longest_step[c])
             crowd = model.first_flagellum[c + 1] - model.first_flagellum[c] > 2
             flexible = weak or (crowd and flexible_in(stability, c, step[c]))
-            # The growth of a probe of any direction may exceed kappa by far: stiff cells are solved with the full
-            # mobility until their probe has turned toward the leading eigenvector.
+            # A probe of any direction may grow by far more than kappa: stiff cells are solved with the full mobility
+            # until it has turned toward the leading eigenvector.
             kappa = ratio * over_implicit[c]
             if weak:
                 kappa = wp.min(kappa, stability.quotient[c])
@@ -349,8 +349,7 @@ def schedule(
 ) -> None:
     """Which cells are measured in this pass, into `measured` and `due`.
 
-    A cell is measured at each of its first steps, then at every fourth, and whenever a step has been rejected; one or
-    two flexible flagella every 32 steps.
+    At each of its first steps, then at every fourth, and after a rejected one; one or two flexible flagella less often.
 
     Args:
         model, state: of the batch.
@@ -380,14 +379,14 @@ def measure(
     Args:
         model, state: of the batch; the forces and velocities of `state` are overwritten.
         stiffness, band: at the state's pose.
-        gain: g, shape [cell_count].
+        gain, over_implicit: shape [cell_count]; longest_step: as in `schedule`.
         response: room for an increment, struct `Increment`.
         stability: struct `Stability`.
-        over_implicit: shape [cell_count].
-        longest_step: as in `schedule`.
     """
     kernels, device = _kernels(model.precision, model.switches.flows.body), model.device
     wp.launch(kernels.mask, model.cell_count, inputs=[stability, state.data], device=device)
+    kept = (model, stability.measured, state.data.pose, stability.probe)
+    kept_increment.bring_back(*kept)
     linearised.apply(model, state, stiffness, band, gain, stability.probe, response)
     inputs = [model.data, state.data, band, stability.probe, stability]
     wp.launch(kernels.dissipate, model.flagellum_count, inputs=inputs, device=device)
@@ -398,3 +397,4 @@ def measure(
     wp.launch(kernels.measure, model.flagellum_count, inputs=inputs, device=device)
     inputs = [model.data, response, band.step, longest_step, stability, over_implicit, state.data]
     wp.launch(kernels.choose, model.cell_count, inputs=inputs, device=device)
+    kept_increment.keep(*kept)
