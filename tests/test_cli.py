@@ -231,6 +231,9 @@ def test_a_sweep_from_the_command_line(scene, capsys):
     assert "--resume out" in line
     assert cli.main(["sweep", scene, *arguments, "--resume-or-start"]) == 0
     assert "another sweep" in refused(capsys, "sweep", scene, "-o", "out", "--resume-or-start")
+    first = Path("out", "0000")
+    assert f"it holds 2 runs, name one: {first}" in refused(capsys, "export", "out", "--to", "csv")
+    assert "warpflag sweep out/sweep.toml" in refused(capsys, "run", "out/sweep.toml")
 
 
 def test_bad_members_are_a_line_each_and_nothing_is_made(scene, capsys):
@@ -250,6 +253,9 @@ def test_a_script_for_slurm_names_every_share(scene, capsys):
     assert f'--resume {Path("out").resolve()} --share "$SLURM_ARRAY_TASK_ID/3"' in script
     checked = subprocess.run(["bash", "-n"], input=script, text=True, capture_output=True)
     assert checked.returncode == 0, checked.stderr
+    on_gpus = ["sweep", scene, *arguments, "--device", "cuda", "--resume-or-start"]
+    assert cli.main(on_gpus) == 0 and "ask Slurm for no GPU" in capsys.readouterr().err
+    assert cli.main([*on_gpus, "--slurm-set", "gpus-per-task=1"]) == 0 and capsys.readouterr().err == ""
 
 
 def test_a_run_says_where_it_wrote_and_nothing_of_warp(scene):

@@ -8,6 +8,9 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from warpflag.base.exit_status import DONE
+from warpflag.base.streams import tell
+
 if TYPE_CHECKING:
     from warpflag.base.forked import Starter
     from warpflag.run.run import Outcome
@@ -151,6 +154,8 @@ def _submitted(started: SweepRun, options: argparse.Namespace, seconds: float) -
     from warpflag.run.sweep import slurm
 
     further = dict(pair.partition("=")[::2] for pair in options.slurm_set)
+    if (options.device or "").startswith("cuda") and not any("gres" in key or "gpu" in key for key in further):
+        tell(f"--device {options.device}: these jobs ask Slurm for no GPU; --slurm-set gres=gpu:1 does", DONE)
     jobs = slurm.Jobs(started, seconds, options.jobs, options.workers, options.device, options.movies, further)
     return jobs.script() if options.slurm_script else jobs.submit()
 

@@ -27,7 +27,7 @@ def add(commands: Any) -> None:
     )
     plotting.add_argument("directories", nargs="+", metavar="DIR", help="run directory, or the directory of one sweep")
     plotting.add_argument(
-        "--x", metavar="COLUMN", help="of a sweep: draw against this column (default: its first axis)"
+        "--x", metavar="COLUMN", help="of a sweep: draw against this column (default: its first axis, or the member)"
     )
     plotting.add_argument(
         "--y", nargs="+", default=[], metavar="COLUMN", help="observables of runs, or numbers of a sweep's table"

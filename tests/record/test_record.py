@@ -133,6 +133,9 @@ def test_frame_arrays_index_like_arrays(tmp_path, key):
     everything = np.stack([frame(index).positions for index in range(23)])
     np.testing.assert_array_equal(record.positions[key], everything[key])
     record.close()
+    with pytest.raises(AttributeError, match=r"have no mean; \[:\] reads all"):
+        record.positions.mean()  # pyright: ignore[reportAttributeAccessIssue]
+    assert np.mean(record.positions) == everything.mean() and not hasattr(record.positions, "mean")
 
 
 def test_frame_arrays_end_with_the_committed_frames(tmp_path):

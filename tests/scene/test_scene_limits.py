@@ -279,3 +279,9 @@ def test_crowded_anchors_are_refused_by_name(values, key):
 )
 def test_anchors_a_filament_apart_are_allowed(values):
     with_values(paper_scene("a"), values)
+
+
+def test_two_flagella_without_a_body_are_one_problem(path):
+    """Their anchors, which there are none of, are no second one."""
+    path.write_text("format = 1\n[flagella]\ncount = 2\n[body]\nenabled = false")
+    assert "must be 1 where body.enabled = false" in refusal(path)

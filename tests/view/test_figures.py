@@ -164,6 +164,10 @@ def test_a_short_peak_does_not_flatten_the_rest_and_is_told(tmp_path):
         ),
         ([{"duration": 0.1}, {"duration": 0.2}], ("duration (s)", ["0.1", "0.2"], [0.1, 0.2])),
         ([{"name": "a"}, {"name": "b"}], ("", ["a", "b"], None)),
+        (
+            [{"motor.torque": 2.0}, {"motor.torque": 3.0, "start.record": "runs/s"}],
+            ("motor.torque (pN µm)", ["2", "3"], [2.0, 3.0]),
+        ),
         ([{}, {"name": "b"}, {}], ("", ["s (1)", "b", "s (3)"], None)),
         (
             [{"flagella.count": 2, "flagellum.1.torque": 1.0}, {"flagella.count": 2, "flagellum.1.torque": 2.0}],
@@ -202,7 +206,9 @@ def test_command_draws_the_observables_that_are_named(made, monkeypatch, capsys)
         LENGTH
     ]
     assert cli.main(["plot", run, "--y", "wobble", "-o", "a.png"]) == 2
-    assert "have no wobble in common; they have phase_difference" in capsys.readouterr().err
+    assert "this run has no wobble; known: phase_difference" in capsys.readouterr().err
+    assert cli.main(["plot", run, run, "--y", "net_energy", "-o", "a.png"]) == 2
+    assert "these runs have no net_energy in common; did you mean elastic_energy? known:" in capsys.readouterr().err
 
 
 def test_many_flagella_are_drawn_as_mean_and_range(tmp_path):

@@ -19,7 +19,7 @@ def sweep(directory, axes: dict[str, list], rows: list[str], columns: str):
     directory.mkdir()
     lines = [f'"{key}" = {values}' for key, values in axes.items()]
     (directory / "sweep.toml").write_text("[axes]\n" + "\n".join(lines) + "\n")
-    header = f"member,point,repeat,{','.join(axes)},status,{columns}"
+    header = ",".join(["member,point,repeat", *axes, "status", columns])
     (directory / "table.csv").write_text("\n".join([header, *rows]) + "\n")
     return directory
 
@@ -110,6 +110,15 @@ def test_points_that_are_not_what_they_say_are_hollow(tmp_path):
         assert hollow.get_markerfacecolor() == "white"
     assert figure.axes[0].get_xlim() == figure.axes[1].get_xlim()
     assert "not bundled" in figure.get_supxlabel() and "every repeat" in figure.get_supxlabel()
+
+
+def test_without_an_axis_members_are_drawn_with_their_mean(tmp_path):
+    rows = ["0,0,0,done,10,0.004", "1,0,1,done,14,0.006", "2,0,2,done,12,"]
+    directory = sweep(tmp_path / "repeats", {}, rows, "rates.net_speed,events.zipped")
+    speed = sweep_figures.curves(sweep_figures.read(directory)).axes[0]
+    points, _, _ = speed.containers[0]
+    assert points.get_xydata().tolist() == [[0, 10], [1, 14], [2, 12]] and points.get_linestyle() == "None"
+    assert speed.get_title() == f"12 ± {2 / 3**0.5:.2g}" and speed.get_xlabel() == "member"
 
 
 def test_nothing_is_hollow_where_no_member_zips(grid):

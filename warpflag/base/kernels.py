@@ -102,7 +102,8 @@ def _explained(missing: set[Path], quiet: bool, explained_after: float) -> Itera
     def explain() -> None:
         if over.wait(explained_after):
             return
-        kind = f"compiling {len(missing)} modules of kernels, once for each kind of scene on each machine"
+        plural = "s" if len(missing) > 1 else ""
+        kind = f"compiling {len(missing)} module{plural} of kernels, once for each kind of scene on each machine"
         tell(f"{kind}, up to two minutes; kept in {kernel_folder()}")
         if not is_terminal(sys.stderr):
             return

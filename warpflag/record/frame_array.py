@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,11 @@ class FrameArray:
         if isinstance(first, slice) or not rows.ndim:
             return block[rows - low][(slice(None),) * rows.ndim + tuple(rest)]
         return block[(rows - low, *rest)]  # frames by an array go together with other arrays, one by one
+
+    if not TYPE_CHECKING:  # a type checker knows by itself that there is no such method
+
+        def __getattr__(self, name: str) -> Any:
+            raise AttributeError(f"frames are read as they are indexed and have no {name}; [:] reads all of them")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[:], dtype=dtype)

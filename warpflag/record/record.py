@@ -60,7 +60,7 @@ class Record:
         self._file: Any = None
         self._stays_open = False
         if not self.path.is_file():
-            raise RecordError(f"{self.path}: no such record")
+            raise RecordError(f"{self.path}: no such record{_runs_within(self.path.parent)}")
 
     def __repr__(self) -> str:
         try:
@@ -269,3 +269,9 @@ class Record:
             observables={name: self._frames(f"observables/{name}")[index] for name in self._observable_names},
             forms=None if forms is None else forms[index].astype(np.int8),
         )
+
+
+def _runs_within(directory: Path) -> str:
+    """What to say of a directory without a record but with runs in it, as that of a sweep is."""
+    found = sorted(directory.glob(f"*/{RECORD_NAME}"))
+    return f"; it holds {len(found)} runs, name one: {found[0].parent}" if len(found) > 1 else ""

@@ -230,7 +230,8 @@ def _prolonged(scene: Scene, overrides: Sequence[str]) -> Scene:
     """The scene with another duration and as many frames as that takes at its interval."""
     values = read_overrides(overrides)
     for key in values.keys() - {"duration"}:
-        raise SceneError(key, values[key], "a run that is resumed takes no other change than duration", source="--set")
+        problem = "a run that is resumed takes no other change than duration; start.record goes on from it with others"
+        raise SceneError(key, values[key], problem, source="--set")
     if not values:
         return scene
     try:

@@ -46,7 +46,7 @@ class Simulation:
         scenes: one scene, or one per cell of a batch. All of a batch share precision, stepper and switches.
         device: "cpu", "cuda:0", ...; default: Warp's preferred one.
         starts: initial shapes, one per scene; default: from the scenes.
-        reporters: take the frames of the next `run` of a single scene, and are closed and let go at its end.
+        reporters: take the frames of every `run` of a single scene, and are closed at the end of each.
         capture: replay a captured pass (the default) or launch every kernel from Python; same numbers.
         strict: kernels built without reassociation, for comparisons to the last bit.
         plan: how kernels are executed, in place of what is chosen for the device; then neither `device` nor `strict`.

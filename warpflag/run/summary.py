@@ -91,8 +91,8 @@ def kept_words(facts: Mapping[str, Any]) -> str:
     words = f"error estimate {mean:.2g} times the {facts['asked']:g} um/ms asked for"
     if worst > max(_NOTABLE_WINDOW, _NOTABLE_WINDOW * mean):
         words += f" (worst {worst:.2g} times, just before {1e3 * facts['worst_window_end']:.4g} ms)"
-    if facts["steps_at_shortest"]:
-        words += f", {facts['steps_at_shortest']} steps as short as estimates may ask for"
+    if shortest := facts["steps_at_shortest"]:
+        words += f", {shortest} step{'s' if shortest > 1 else ''} as short as estimates may ask for"
     return words
 
 

@@ -46,6 +46,9 @@ def load(path: str | Path, overrides: Mapping[str, Any] | Sequence[str] = ()) ->
         values, tables = scene_file.flattened(scene_file.read_toml(Path(path)), _SECTIONS)
     except SceneError as error:
         raise (error if error.source else error.located(path)) from None
+    if isinstance(values.get("base"), str):
+        problem = f"is a sweep file, no scene: warpflag sweep {path}"
+        raise SceneError(None, None, problem, source=str(path))
     values.setdefault("name", re.sub(r"[^\w.+-]+", "-", Path(path).stem).strip("-.+") or "scene")
     try:
         scene = _built({**_of_format(values), **given}, tables)

@@ -293,7 +293,7 @@ class Scene(Section, key=""):
                         told.add(error.key)
                         with problems:
                             raise
-        if self.steric.enabled and not any(key and key.endswith("anchor_offset") for key in told):
+        if self.steric.enabled and self.body.enabled and not any(key and key.endswith("anchor_offset") for key in told):
             with problems:
                 self._check_distances()
 

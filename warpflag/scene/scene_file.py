@@ -21,6 +21,7 @@ __all__ = ["flattened", "nearest", "parsed", "read_overrides", "read_toml", "sec
 _LARGEST_FILE = 4 * 2**20
 _LONGEST_QUOTE = 80  # characters of a line that an error shows: a line of a terminal
 _DEEPEST_NESTING = 16  # levels of arrays, inline tables and dotted keys: a scene has four
+_ALIKE = 0.51  # of the letters of two names, beyond which one may be meant by the other
 _MOST_DIGITS = 1000  # of a number: far beyond any float, and few enough for the parser's quadratic time
 
 # Strings, also those without an end, and comments: what looks like brackets or dots there is none.
@@ -190,14 +191,22 @@ def section_lines(section: Section) -> list[str]:
     return lines
 
 
+def _alike(one: str, other: str) -> bool:
+    return difflib.SequenceMatcher(None, one, other).ratio() >= _ALIKE
+
+
 def nearest(key: str, known: Iterable[str]) -> str | None:
     """The known dotted key that `key` was probably meant to be; None where none is near."""
     if len(key) > 200:
         return None
     known = list(known)
-    leaf = key.rpartition(".")[2]
+    section, _, leaf = key.rpartition(".")
     same_leaf = [other for other in known if other.rpartition(".")[2] == leaf]
-    near = difflib.get_close_matches(key, same_leaf or known, 1, 0.0 if same_leaf else 0.6)
+    sections = {other.rpartition(".")[0] for other in same_leaf}
+    if len(sections) > 1 and section and not difflib.get_close_matches(section, sections, 1):
+        return None  # wall.enabled: several sections have it, and none has a name like that
+    near = same_leaf or [other for other in known if _alike(leaf, other.rpartition(".")[2])]
+    near = difflib.get_close_matches(key, near, 1, 0.0 if same_leaf else 0.6)
     if near:
         return near[0]
     by_leaf = {other.rpartition(".")[2]: other for other in reversed(known)}

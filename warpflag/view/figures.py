@@ -7,6 +7,7 @@ has a panel of its own, and legends stand outside. A figure displays itself wher
 from __future__ import annotations
 
 import contextlib
+import difflib
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -200,7 +201,12 @@ def _compared(runs: Sequence[Run], names: Sequence[str]) -> list[str]:
     """The observables to compare: those named, or the usual ones that all runs have."""
     shared = [name for name in runs[0].curves if all(name in run.curves for run in runs)]
     if unknown := [name for name in names if name not in shared]:
-        raise OutputError(f"these runs have no {unknown[0]} in common; they have {', '.join(shared)}")
+        whose = "these runs have no {} in common" if len(runs) > 1 else "this run has no {}"
+        last = unknown[0].rpartition("_")[2]  # speed, net_speed: body_speed
+        near = [name for name in shared if name.rpartition("_")[2] == last]
+        near = near or difflib.get_close_matches(unknown[0], shared, 1)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        raise OutputError(f"{whose.format(unknown[0])}; {hint}known: {', '.join(shared)}")
     found = list(names) or [name for name in (*_BUNDLING, *_SWIMMING) if name in shared]
     if not names and len(found) < len(_BUNDLING) and "elastic_energy" in shared:
         found.append("elastic_energy")

@@ -10,7 +10,8 @@ from warpflag.scene import Scene, dumps
 
 __all__ = ["Labels", "labels_of"]
 
-_WEAK_KEYS = ("name", "duration", "frames")  # they label runs only where nothing else differs
+# They label runs only where nothing else differs.
+_WEAK_KEYS = ("name", "duration", "frames", "start.record", "start.frame")
 _LONGEST_LABEL = 48  # letters of a label
 
 

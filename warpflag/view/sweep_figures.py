@@ -198,19 +198,22 @@ def _style() -> Iterator[None]:
 def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> Figure:
     """A panel per number against one column; mean and standard error where rows share it; a line per second axis.
 
-    A column of words has a place for each. What is a mean over further axes says so.
+    A column of words has a place for each. What is a mean over further axes says so. Points against the number of the
+    member or repeat are not joined. Without an axis, members are drawn, and their mean with its standard error stands
+    above each panel.
 
     A point is hollow where it does not stand for all that its name says: see `Table.whole`.
 
     Args:
         table: of a sweep.
-        x: column of the abscissa; default: the first axis.
+        x: column of the abscissa; default: the first axis, or the member where there is none.
         numbers: columns to draw; default: those of `DEFAULT_NUMBERS` that hold something.
 
     Raises:
         OutputError: there is no such column, or none with anything to draw.
     """
     x, numbers = _abscissa(table, x), _drawn(table, numbers)
+    numbered = x in _BEFORE_NUMBERS  # members and repeats have an order, but nothing between them
     (position, words), others = table.positions(x), [axis for axis in table.axes if axis != x]
     lines, line_of = table.levels(others[0]) if others else ([""], np.zeros(len(position), dtype=int))
     from matplotlib.lines import Line2D
@@ -226,7 +229,8 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
             means = np.array([row.mean() if len(row) else math.nan for row in rows])
             errors = [row.std(ddof=1) / math.sqrt(len(row)) if len(row) > 1 else 0.0 for row in rows]
             color = COLORS[k % len(COLORS)]
-            panel.errorbar(places, means, errors, capsize=2, color=color, linestyle="none" if words else "-")
+            line = "none" if words or numbered else "-"
+            panel.errorbar(places, means, errors, capsize=2, color=color, linestyle=line)
             full = np.array([bool(whole[at].all()) for at in here])
             panel.plot(places[full], means[full], "o", markersize=3.5, color=color)
             hollow = ~full & np.isfinite(means)
@@ -238,11 +242,15 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
         panel.set_ylabel(_label(name))
         if words:
             panel.set_xticks(range(len(words)), [_short(word) for word in words])
+        elif numbered:
+            panel.locator_params(axis="x", integer=True)
         elif _in_equal_ratios(position):
             panel.set_xscale("log")
         else:
             panel.ticklabel_format(axis="x", scilimits=(-2, 5), useMathText=True)
         panel.set_xlim(*_with_margin(position, panel.get_xscale() == "log"))
+        if not table.axes:
+            _show_mean(panel, values[np.isfinite(values)])
     if others:
         handles = [Line2D([], [], marker="o", markersize=3.5, color=COLORS[k % len(COLORS)]) for k in range(len(lines))]
         labels = [f"{_leaf(others[0])} {_short(line)}".replace("_", " ") for line in lines]
@@ -261,6 +269,14 @@ def _say(figure: Figure, *notes: str) -> None:
     """Notes below a figure, where there are any."""
     if any(notes):
         figure.supxlabel("; ".join(filter(None, notes)), fontsize=7)
+
+
+def _show_mean(panel: Axes, values: Array) -> None:
+    """The mean of all members as a line, and above the panel with its standard error."""
+    if len(values) > 1:
+        error = values.std(ddof=1) / math.sqrt(len(values))
+        panel.axhline(values.mean(), color="0.6", linewidth=0.8, zorder=0)
+        panel.set_title(f"{values.mean():.4g} ± {error:.2g}", fontsize=8)
 
 
 def _with_margin(position: Array, logarithmic: bool) -> tuple[float, float]:
@@ -322,9 +338,9 @@ def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
 
 
 def _abscissa(table: Table, x: str | None) -> str:
-    if x is None and not table.axes:
-        raise OutputError(f"{table.name}: has no axis; name the column to draw against with --x")
-    return table.axes[0] if x is None else table.full_name(x)
+    if x is None:
+        return table.axes[0] if table.axes else "member"
+    return table.full_name(x)
 
 
 def _drawn(table: Table, numbers: Sequence[str]) -> list[str]:

@@ -60,11 +60,13 @@ def test_a_sweep_leaves_a_run_per_member_and_a_table(tmp_path):
 def test_pandas_reads_the_tables_in_one_line(tmp_path):
     pandas = pytest.importorskip("pandas")
     plan = Sweep(small(BASE), {"motor.torque": [1.0]}, {"flagellum.torque": {"low": 1.0, "high": 2.0}}, repeats=2)
-    sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True)
+    told = sweep.start(plan, str(tmp_path / "out")).execute(workers=1, quiet=True).message
     table = pandas.read_csv(tmp_path / "out" / "table.csv")
     assert table["rates.net_speed"].dtype == float and len(table) == 2
     held = pandas.DataFrame(h5py.File(tmp_path / "out" / "table.h5")["members"][:])
     assert (held["rates.net_speed"] == table["rates.net_speed"]).all()
+    speed = table["rates.net_speed"]
+    assert told.endswith(f"; net_speed {speed.mean():.4g} +- {speed.sem():.2g} um/s (standard error of 2)")
 
 
 def test_means_and_standard_errors_are_those_of_the_repeats(tmp_path):

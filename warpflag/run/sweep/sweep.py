@@ -248,6 +248,10 @@ class SweepRun:
             reason = f" ({ended.reason})" if ended.reason else ""
             return Outcome(ended.status, f"{told}; {ended.status}{reason}; resumable with --resume {self.directory}")
         told += f" in {seconds:.1f} s: {self.directory / table.TABLE_NAME}"
+        if not any(member.point for member in self.members):  # repeats of one point: their mean is what was asked for
+            done = [self._directory(k) for k, status in zip(own, found, strict=True) if status == "done"]
+            mean = table.mean_speed(done)
+            told += f"; {mean}" if mean else ""
         first = next((f"; {message}" for message in failed.values() if message), "")
         told += first + (f" (and {len(failed) - 1} more)" if first and len(failed) > 1 else "")
         if failed or set(counts) - set(FINISHED):

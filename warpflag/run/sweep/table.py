@@ -13,7 +13,7 @@ import numpy as np
 from warpflag.base.output import whole
 from warpflag.run.run_directory import SCENE_NAME, summary_of
 
-__all__ = ["MEANS_NAME", "TABLE_NAME", "status_of", "write"]
+__all__ = ["MEANS_NAME", "TABLE_NAME", "mean_speed", "status_of", "write"]
 
 TABLE_NAME, MEANS_NAME, HDF5_NAME = "table.csv", "means.csv", "table.h5"
 # Entries of a summary that the table takes; what the machine took for them is no result.
@@ -24,6 +24,16 @@ def status_of(directory: Path) -> str:
     """The status of a member: that of its summary, "begun" before there is one, "missing" before it began."""
     begun = "begun" if (directory / SCENE_NAME).exists() else "missing"
     return str(summary_of(directory).get("status", begun))
+
+
+def mean_speed(directories: Sequence[Path]) -> str:
+    """The mean net speed of members that are done, with its standard error, in words; empty without two of them."""
+    found = [_flat(summary_of(path).get("rates") or {}).get("net_speed", math.nan) for path in directories]
+    speeds = np.array([speed for speed in found if isinstance(speed, float) and math.isfinite(speed)])
+    if len(speeds) < 2:
+        return ""
+    error = speeds.std(ddof=1) / math.sqrt(len(speeds))
+    return f"net_speed {speeds.mean():.4g} +- {error:.2g} um/s (standard error of {len(speeds)})"
 
 
 def write(directory: Path, members: Sequence[Any], names: Sequence[str]) -> None:
