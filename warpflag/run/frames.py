@@ -113,6 +113,11 @@ class Frames:
         stepper.dense = self._dense = frame_slots.allocate(self._system.model, self._system.state)
 
     @property
+    def intervals(self) -> np.ndarray:
+        """Time between two frames of each cell [s], shape [cell_count]."""
+        return self._durations / self._counts
+
+    @property
     def taken(self) -> bool:
         """Whether the stepper takes frames."""
         return self._dense is not None

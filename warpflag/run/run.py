@@ -17,6 +17,7 @@ from warpflag.base.streams import tell
 from warpflag.model.start import shape_of_frame
 from warpflag.record import RECORD_NAME, Record, RecordError
 from warpflag.run import checkpoint
+from warpflag.run.carried_values import check_frame
 from warpflag.run.execute import Run
 from warpflag.run.lock import Lock
 from warpflag.run.member import Member, Outcome
@@ -165,12 +166,16 @@ def _resumed(
             metas.append(meta)
             with Record(path) as record:
                 origins.append(shape_of_frame(record.frame(0), record.first_node))
+                try:
+                    check_frame(arrays, record, scene.duration / scene.frames)
+                except (KeyError, ValueError) as error:
+                    raise _not_sound(path, error) from None
         simulation = Simulation(scenes, starts=origins, device=device or metas[0]["device"], strict=strict)
         try:
             names = parts[0].keys()
             simulation.restore({name: np.concatenate([part[name] for part in parts]) for name in names})
         except (KeyError, ValueError) as error:
-            raise RunError(f"--resume {paths[0]}: {error}") from None
+            raise _not_sound(paths[0], error) from None
     else:
         raise RunError(f"--resume {paths[0]}: some runs of the batch have a checkpoint and some have none")
     members = []
@@ -178,6 +183,11 @@ def _resumed(
         members.append(Member(path, scene, lock, metas[k] if metas else None, alone=len(paths) == 1))
         write_whole(path / SCENE_NAME, members[-1].text)
     return Run(simulation, members, **options)
+
+
+def _not_sound(path: Path, error: Exception) -> RunError:
+    told = f"has no {error}" if isinstance(error, KeyError) else str(error)
+    return RunError(f"--resume {path}: its checkpoint: {told}")
 
 
 def begun_at_checkpoint(directory: Path) -> bool:
@@ -192,6 +202,8 @@ def _checkpoint(path: Path, scene: Scene) -> tuple[dict[str, np.ndarray], dict[s
 
     def fits(meta: Any) -> bool:
         if not isinstance(meta, dict) or not all(isinstance(meta.get(name), kind) for name, kind in _META.items()):
+            return False
+        if not 0.0 <= meta["wall_time"] < np.inf:
             return False
         return bool((np.abs(times - meta["time"]) <= 1e-12 * abs(meta["time"])).any())
 

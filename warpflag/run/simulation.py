@@ -25,6 +25,7 @@ from warpflag.model.starts import starting_states
 from warpflag.record import Frame, FrameRows
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, hand_over
+from warpflag.run.carried_values import check_values
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames, finite_time, one_by_one
@@ -308,7 +309,7 @@ class Simulation:
         """Takes back what `checkpoint` gave, in a simulation of the same scenes.
 
         Raises:
-            ValueError: the arrays are of another simulation.
+            ValueError: the arrays are of another simulation, or of no state that one can be in.
         """
         parts: dict[str, dict[str, np.ndarray]] = {"stepper": {}, "frame": {}}
         for name, x in arrays.items():
@@ -321,6 +322,7 @@ class Simulation:
         for name, then in arrays.items():
             if (then.shape, then.dtype) != (own[name].shape, own[name].dtype):
                 raise ValueError(f"the checkpoint is of other cells: {name} has shape {then.shape}, type {then.dtype}")
+        check_values(arrays, self._frames.intervals, self.first_node[:-1])
         for name, array in self.system.carried().items():
             array.assign(arrays[name])
         self.stepper.restart()
