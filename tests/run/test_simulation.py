@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from warpflag_kernels.stepping import frame_slots
 
 from tests.runs import assert_same_frames, ended_at, executed, frame_by_frame, small
 from warpflag.record import Frame, Record, RecordError
@@ -48,6 +49,55 @@ def test_a_restored_simulation_goes_on_with_the_same_bits(values, device):
             np.testing.assert_array_equal(a.directors, b.directors)
             for name, value in a.observables.items():
                 np.testing.assert_array_equal(value, b.observables[name])
+
+
+def times_of(frames):
+    return [frame.time for frame in frames]
+
+
+def test_frames_go_on_where_an_iterator_was_left(device):
+    """Frames come in blocks, of which those that nobody has taken are not lost."""
+    scene = small()
+    whole = list(Simulation(scene, device=device).frames(scene.duration))
+    simulation = Simulation(scene, device=device)
+    frames = simulation.frames(scene.duration)
+    first = [next(frames) for _ in range(3)]
+    with pytest.raises(ValueError, match="frames that were not taken yet"):
+        simulation.checkpoint()
+    until = whole[4].time
+    found = first + list(simulation.frames(until)) + list(simulation.frames(scene.duration))
+    assert times_of(found) == times_of(whole) and next(frames, None) is None
+    for a, b in zip(found, whole, strict=True):
+        np.testing.assert_array_equal(a.positions, b.positions)
+
+
+def test_two_iterators_share_the_frames_of_a_batch(device, monkeypatch):
+    monkeypatch.setattr(frame_slots, "MOST_SLOTS", 3)
+    scenes = [small(), small({"frames": 5})]
+    simulation = Simulation(scenes, device=device)
+    one, two = simulation.cell_frames(), simulation.cell_frames()
+    found = {0: [], 1: []}
+    while True:
+        taken = [frames for frames in (next(one, None), next(two, None)) if frames is not None]
+        for frames in taken:
+            for cell, frame in frames.items():
+                found[cell].append(frame.time)
+        if not taken:
+            break
+    for cell, scene in enumerate(scenes):
+        np.testing.assert_allclose(found[cell], np.linspace(0.0, scene.duration, scene.frames + 1), rtol=1e-12)
+
+
+def test_a_restored_simulation_forgets_frames_of_before(device):
+    scene = small()
+    simulation = Simulation(scene, device=device)
+    next(simulation.frames(scene.duration))
+    with frame_by_frame():
+        other = Simulation(scene, device=device)
+        frames = other.frames(scene.duration)
+        kept = [other.checkpoint() for _ in zip(range(3), frames, strict=False)][-1]
+    simulation.restore(kept)
+    assert times_of(simulation.frames(scene.duration)) == [k * 1e-5 for k in range(3, 9)]
 
 
 def test_a_checkpoint_of_other_cells_is_refused():

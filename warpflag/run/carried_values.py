@@ -17,7 +17,7 @@ _NOT_BELOW_0 = (
     *("control.time", "control.steps", "frame.time", "frame.before_step_before", "stepper.evaluations"),
     *("stepper.last_step", "stepper.step_before", "stepper.wanted_step", "stepper.rejected", "stepper.noise_products"),
     *("stepper.error_sum", "stepper.error_time", "stepper.kappa", "stepper.balance_refused", "stepper.balance_lasting"),
-    *("stepper.stage", "stepper.probe_norm", "stepper.probes_left", "stepper.spectral_radius"),
+    *("stepper.probe_norm", "stepper.probes_left", "stepper.spectral_radius"),
     *("stepper.achieved_total", "stepper.achieved_total_time", "stepper.achieved_window", "stepper.achieved_worst"),
     *("stepper.achieved_window_time", "stepper.achieved_worst_end", "stepper.achieved_span"),
     *("stepper.achieved_span_time", "stepper.achieved_at_shortest"),
@@ -25,6 +25,7 @@ _NOT_BELOW_0 = (
 ALLOWED: dict[str, tuple[float, float]] = {
     **dict.fromkeys(_NOT_BELOW_0, _AT_LEAST_0),
     "frame.index": (-1.0, math.inf),
+    "stepper.stage": (-1.0, math.inf),
     "stepper.history": (0.0, 2.0),
     "stepper.over_implicit": (1.0, math.inf),
     "stepper.share": _FROM_0_TO_1,

@@ -6,6 +6,7 @@ Frames are taken on the device, inside steps (`warpflag_kernels.stepping.dense_o
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -97,6 +98,7 @@ class Frames:
         self._dense: frame_slots.DenseOutput | None = None
         self._end_steps = False  # at frames
         self._wanted = np.zeros((len(scenes), 0))
+        self._unread: deque[dict[int, Frame]] = deque()
         cells = len(scenes)
         self.index = np.full(cells, -1, dtype=np.int64)
         self.last = {
@@ -135,12 +137,34 @@ class Frames:
             KeyError: something is missing.
             ValueError: the shapes are of other cells.
         """
+        self._unread.clear()
         self.index[:] = memory["index"]
         for name, values in self.last.items():
             values[...] = memory[name]
         if self._dense is not None:
             for name, array in self._dense.memory().items():
                 array.assign(memory[f"before_{name}"])
+
+    @property
+    def unread(self) -> int:
+        """How many frames `put` has got that nobody has taken; those of several cells at one time count once."""
+        return len(self._unread)
+
+    def put(self, block: Iterable[Mapping[int, FrameRows]]) -> None:
+        """Keeps frames that were read until `take` hands them on one by one, to whoever asks."""
+        self._unread.extend(one_by_one(block))
+
+    def take(self, until: float | None) -> dict[int, Frame] | None:
+        """The next frame of each cell that has one, by cell; None: all that were read up to a time [s] are taken."""
+        latest = np.full(len(self.index), np.inf) if until is None else until + _ROUNDING * self.intervals
+        for k, frames in enumerate(self._unread):
+            due = {cell: frame for cell, frame in frames.items() if frame.time <= latest[cell]}
+            if due:
+                self._unread[k] = {cell: frame for cell, frame in frames.items() if cell not in due}
+                if not self._unread[k]:
+                    del self._unread[k]
+                return due
+        return None
 
     def pass_by(self, times: np.ndarray) -> None:
         """Counts frames up to these times [s] as past, though they were not recorded."""

@@ -28,7 +28,7 @@ from warpflag.record.reporters import Reporter, hand_over
 from warpflag.run.carried_values import check_values
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
-from warpflag.run.frames import Frames, finite_time, one_by_one
+from warpflag.run.frames import Frames, finite_time
 from warpflag.scene import Scene
 from warpflag.stepping import System, make_stepper
 from warpflag.stepping.replay import Replay
@@ -140,6 +140,8 @@ class Simulation:
     def frames(self, until: float, watch: Callable[[], None] | None = None) -> Iterator[Frame]:
         """Advances one scene to a time and yields a frame at each multiple of its duration / frames on the way.
 
+        The scene has one stream of frames: where an iterator was left, the next one goes on.
+
         Args:
             until: simulated time to reach [s].
             watch: as in `advance`.
@@ -157,9 +159,17 @@ class Simulation:
     def cell_frames(
         self, until: float | None = None, watch: Callable[[], None] | None = None
     ) -> Iterator[dict[int, Frame]]:
-        """The frames of `frame_blocks` one after the other: the next frame of each cell that has one, by cell."""
-        for block in self.frame_blocks(until, watch):
-            yield from one_by_one(block)
+        """The frames of `frame_blocks` one after the other: the next frame of each cell that has one, by cell.
+
+        A simulation has one stream of frames: a further iterator goes on with the first frame that nobody has taken.
+        """
+        blocks = self.frame_blocks(until, watch)
+        while True:
+            while (frames := self._frames.take(until)) is not None:
+                yield frames
+            if (block := next(blocks, None)) is None:
+                return
+            self._frames.put(block)
 
     def frame_blocks(
         self, until: float | None = None, watch: Callable[[], None] | None = None
@@ -299,7 +309,16 @@ class Simulation:
 
     @alone
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name."""
+        """What `restore` needs to go on from here with the same bits; valid after `advance`. Arrays by name.
+
+        Raises:
+            ValueError: frames were read that nobody has taken from `frames`; they would be lost.
+        """
+        if self._frames.unread:
+            raise ValueError(f"{self._frames.unread} frames that were not taken yet would be lost: take them first")
+        return self._memory()
+
+    def _memory(self) -> dict[str, np.ndarray]:
         own = {name: array.numpy().copy() for name, array in self.system.carried().items()}
         own |= {f"frame.{name}": values for name, values in self._frames.memory().items()}
         return {**own, **{f"stepper.{name}": values.copy() for name, values in self.stepper.memory().items()}}
@@ -316,7 +335,7 @@ class Simulation:
             parts.get(name.partition(".")[0], {})[name.partition(".")[2]] = x
         if "before_position" in parts["frame"] and not self._frames.taken:
             self._take_frames()
-        own = self.checkpoint()
+        own = self._memory()
         if own.keys() != arrays.keys():
             raise ValueError("the checkpoint is of another version or another stepper")
         for name, then in arrays.items():
