@@ -29,7 +29,7 @@ lost: what was committed can't be read, or a run can't go on.
 traceback: more than the lines that a user should see, a crash, or no end.
 """
 ROOT = Path(__file__).parent.parent.parent
-PATIENCE = 120.0
+PATIENCE = 600.0
 """Wall time after which a command is taken to hang [s]."""
 LIFE = 1.05
 """Times the undisturbed wall time of a command within which a signal comes: now and then it has ended before."""

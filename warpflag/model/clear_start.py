@@ -31,6 +31,7 @@ _TURNS = 300  # steps of turning
 _LARGEST_STEP = 0.03  # rad: moves the tip of a flagellum of 7 um by the radius of its helix
 _LARGEST_TOTAL_TURN = 45.0  # deg; a flagellum that would have to be turned by more is refused
 _SOFT = 1e-4  # um^2; regularises the least squares: lever arms below its root, 0.01 um, hardly count
+_RUN = 64  # nodes of a flagellum that are looked at together
 _MOST_FLAGELLA = 500  # in larger crowds flagella that overlap at the start are left to the contact force
 
 
@@ -198,11 +199,7 @@ class _Cell:
         e = np.concatenate([np.diff(x, axis=0) for x in others])
         longest = np.linalg.norm(d, axis=1).max() + np.linalg.norm(e, axis=1).max()
         span = reach + longest / 2
-        middles, beside = p + d / 2, q + e / 2
-        inside = ((beside > middles.min(axis=0) - span) & (beside < middles.max(axis=0) + span)).all(axis=1)
-        q, e, beside = q[inside], e[inside], beside[inside]
-        apart = middles[:, None] - beside
-        i, j = np.nonzero(np.vecdot(apart, apart) < span * span)
+        i, j = _pairs_within(p + d / 2, q + e / 2, span)
         s, t = closest_parameters(p[i], d[i], q[j], e[j])
         points = p[i] + s[:, None] * d[i]
         away = points - q[j] - t[:, None] * e[j]
@@ -227,6 +224,29 @@ class _Cell:
                 break
         related = ["flagella.opening_angle", "flagella.phase_difference", f"flagellum.{k}.azimuth"]
         return SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
+
+
+def _pairs_within(a: Array, b: Array, span: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices i, j of points a_i and b_j less than a span apart, in ascending order.
+
+    Neighbours along a flagellum lie beside each other, so runs of them are in small boxes: only those of boxes within
+    the span are compared one by one.
+    """
+    starts = np.arange(0, len(b), _RUN)
+    lowest, highest = np.minimum.reduceat(b, starts), np.maximum.reduceat(b, starts)
+    found_i, found_j = [], []
+    for first in range(0, len(a), _RUN):
+        own = a[first : first + _RUN]
+        low, high = own.min(axis=0) - span, own.max(axis=0) + span
+        runs = starts[((lowest < high) & (highest > low)).all(axis=1)]
+        near = (runs[:, None] + np.arange(_RUN)).ravel()
+        near = near[near < len(b)]
+        near = near[((b[near] > low) & (b[near] < high)).all(axis=1)]
+        apart = own[:, None] - b[near]
+        i, j = np.nonzero(np.vecdot(apart, apart) < span * span)
+        found_i.append(first + i)
+        found_j.append(near[j])
+    return np.concatenate(found_i), np.concatenate(found_j)
 
 
 def _from_body(body: Body, points: Array) -> tuple[Array, Array]:

@@ -238,12 +238,12 @@ class Simulation:
     def load(self, recording: bool = False, quiet: bool = False) -> None:
         """Loads every kernel, of which `prepare` sees to the rest as well; arguments as there."""
         if recording and not self._frames.taken:
-            self._take_frames()
+            self.take_frames()
         if not self._loaded:
             load_kernels(self._launch_all, self.device, quiet)
             self._loaded = True
 
-    def _take_frames(self) -> None:
+    def take_frames(self) -> None:
         """Has the stepper take frames; a pass that was captured without is captured anew."""
         self._frames.take_from(self.stepper)
         self._replay.forget()
@@ -334,7 +334,7 @@ class Simulation:
         for name, x in arrays.items():
             parts.get(name.partition(".")[0], {})[name.partition(".")[2]] = x
         if "before_position" in parts["frame"] and not self._frames.taken:
-            self._take_frames()
+            self.take_frames()
         own = self._memory()
         if own.keys() != arrays.keys():
             raise ValueError("the checkpoint is of another version or another stepper")

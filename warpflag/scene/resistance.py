@@ -121,9 +121,11 @@ def pair_radius(scene: Scene, segment_length: float | None = None) -> float:
         return scene.hydrodynamics.pair_radius
     if scene.hydrodynamics.mode == "as_printed":
         return radius
+    if scene.hydrodynamics.mode == "consistent" and segment_length is not None:
+        return _consistent_radius(segment_length, radius)
     h = max(spec.segment_length for spec in scene.resolved_flagella())
     if scene.hydrodynamics.mode == "consistent":
-        return _consistent_radius(segment_length or h, radius)
+        return _consistent_radius(h, radius)
     return max(radius, _least_radius(scene, h))
 
 

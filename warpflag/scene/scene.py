@@ -7,6 +7,7 @@ degrees. `warpflag.scene.reading` makes scenes of files and of other scenes.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -130,6 +131,10 @@ class Scene(Section, key=""):
 
     def resolved_flagella(self) -> tuple[FlagellumSpec, ...]:
         """Every flagellum with the group's values filled in, in order."""
+        return self._resolved
+
+    @functools.cached_property
+    def _resolved(self) -> tuple[FlagellumSpec, ...]:
         group = self.flagella
         specs = []
         for k, own in enumerate(self.flagellum or (FlagellumOverride(),) * group.count):

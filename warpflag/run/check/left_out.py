@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from warpflag.run.check import rigid
 from warpflag.run.check.rigid import Turning, mesh_dependence
 from warpflag.scene import Scene
 from warpflag.scene.resistance import filament_mobility, spheroid_mobility, steric_diameter
@@ -106,7 +107,8 @@ def mesh(scene: Scene, stiff: Turning) -> str | None:
     """Rate of a bundle of stiff flagella on this mesh and on one half as long."""
     found = mesh_dependence(scene, 0.5)
     if found is None:
-        return None
+        many = max(spec.segment_count for spec in scene.resolved_flagella())
+        return f"mesh: not looked at with {many} segments" if many > 0.5 * rigid.MOST_SEGMENTS else None
     h = max(spec.segment_length for spec in scene.resolved_flagella())
     more = "" if scene.hydrodynamics.mode in ("none", "between", "consistent") else ", and more with finer ones"
     return f"mesh: rates with h = {h:.3g} um are about {100 * found:+.1f} % off those with half of it{more}"

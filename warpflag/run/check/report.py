@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from time import process_time
 from typing import Any
 
 import warp as wp
 from warpflag_kernels.stepping.right_hand_side import stages
 
+from warpflag.run.check import large
 from warpflag.run.check.left_out import left_out
 from warpflag.run.check.noise import of_noise
 from warpflag.run.check.polymorphs import of_polymorphs
@@ -30,7 +32,9 @@ def report(scene: Scene, device: str | None = None) -> str:
         NumericalError: a guard is violated in the first steps.
         SceneError: the scene can't be simulated.
     """
+    began = process_time()
     simulation = Simulation(scene, device=device)
+    built = process_time() - began
     flagella = scene.resolved_flagella()
     segments = sum(spec.segment_count for spec in flagella)
     nodes = segments + len(flagella)
@@ -38,7 +42,11 @@ def report(scene: Scene, device: str | None = None) -> str:
     names = ", ".join(name for name, _launch in stages(model))
     longest = float(simulation.system.control.longest_step.numpy()[0])
     values_per_frame = 6 * nodes + 2 * len(flagella) + 14
-    time = needed(simulation)
+    if nodes > large.LARGEST:
+        time, parts = large.needed_by_parts(scene, built, device)
+        simulation.take_frames()
+    else:
+        time, parts = needed(simulation), []
     stiff = turning(scene)
     lines = [
         f"{len(flagella)} flagella, {segments} segments, {nodes} nodes",
@@ -48,7 +56,7 @@ def report(scene: Scene, device: str | None = None) -> str:
         f"memory {_mebibytes(_device_bytes(simulation))} on the device, "
         f"record {_mebibytes(8 * values_per_frame * (scene.frames + 1))}",
         f"stepper {scene.numerics.stepper}, step at most {longest:.3g} s",
-        *_times(time, scene),
+        *_times(time, scene, parts),
         *simulation.notes[0],
         *of_noise(scene, longest),
         *of_polymorphs(scene, stiff),
@@ -65,13 +73,15 @@ def report(scene: Scene, device: str | None = None) -> str:
     )
 
 
-def _times(time: Needed, scene: Scene) -> list[str]:
+def _times(time: Needed, scene: Scene, parts: list[int]) -> list[str]:
     per_ms = time.stepping / (1e3 * scene.duration)
     lines = [
         f"time {time.least:.2g} to {time.most:.2g} s of computing: start {time.startup:.1f} s, stepping "
         f"{time.stepping:.2g} s ({1e3 * per_ms:.3g} ms per simulated ms; up to {time.crowd:.2g} times that where "
         f"flagella touch), frames, record and movie {time.output:.2g} s"
     ]
+    if parts:
+        lines.append(f"which is a guess: from parts of it with {' and '.join(map(str, parts))} nodes")
     if time.compiling:
         lines.append(f"kernels were compiled just now, in {time.compiling:.0f} s, and are in the cache")
     return lines

@@ -3,6 +3,7 @@ the mesh."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,10 @@ __all__ = ["Turning", "mesh_dependence", "turning"]
 
 _SPACING = 2.5  # of flagella in a bundle [sigma], at which rates change with the mesh as measured; docs/tradeoff.md
 _MOST_NODES = 1000  # of such a bundle: larger ones are represented by fewer flagella
+
+
+MOST_SEGMENTS = 500
+"""Of the flagellum whose resistance is solved for, by dense matrices: more would take minutes and gigabytes."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +53,16 @@ def turning(scene: Scene, segment_length: float | None = None, together: int = 1
         segment_length: of other segments [um].
         together: so many such flagella side by side in a ring, in phase, each turning about its own axis.
 
+    A flagellum of more than `MOST_SEGMENTS` is taken with as many.
+
     Raises:
         SceneError: segments of this length are not allowed.
     """
     if segment_length is not None:
         scene = with_values(scene, {"flagella.segment_length": segment_length, "hydrodynamics.pair_radius": None})
     spec = max(scene.resolved_flagella(), key=lambda own: own.length)
+    if spec.segment_count > MOST_SEGMENTS:
+        scene, spec = _coarser(scene, spec)
     h = spec.segment_length
     helix = ground_state(scene.flagella.strain_at_rest(h), h)
     turn = helix.angle * (np.arange(spec.segment_count + 1))
@@ -68,6 +77,18 @@ def turning(scene: Scene, segment_length: float | None = None, together: int = 1
     rate = abs(spec.torque) / about
     drag = float(2 * np.pi * about)
     return Turning(rate / (2 * np.pi), float(x[-1, 2]), helix.radius, rate * helix.radius, drag)
+
+
+def _coarser(scene: Scene, spec: FlagellumSpec) -> tuple[Scene, FlagellumSpec]:
+    """A scene of one flagellum alone, with `MOST_SEGMENTS` segments, and that flagellum."""
+    own = {"count": 1, "length": spec.length, "segment_length": spec.length / MOST_SEGMENTS, "phase_difference": None}
+    alone = dataclasses.replace(
+        scene,
+        flagella=dataclasses.replace(scene.flagella, **own),
+        flagellum=(),
+        hydrodynamics=dataclasses.replace(scene.hydrodynamics, pair_radius=None),
+    )
+    return alone, dataclasses.replace(alone.resolved_flagella()[0], torque=spec.torque)
 
 
 def _mobility(scene: Scene, spec: FlagellumSpec, x: Array, together: int) -> Array:
@@ -98,6 +119,8 @@ def _mobility(scene: Scene, spec: FlagellumSpec, x: Array, together: int) -> Arr
 def mesh_dependence(scene: Scene, finer: float) -> float | None:
     """Relative change of a stiff flagellum's rate from segments `finer` times as long to the scene's, in a bundle of as
     many as the scene has; None: not allowed."""
+    if max(spec.segment_count for spec in scene.resolved_flagella()) > finer * MOST_SEGMENTS:
+        return None
     try:
         specs = scene.resolved_flagella()
         h, nodes = max(own.segment_length for own in specs), max(own.segment_count for own in specs) / finer + 1

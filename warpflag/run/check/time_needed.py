@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import dataclass
 
@@ -10,15 +11,16 @@ import numpy as np
 from warpflag.observables import bundle_length, phase_difference
 from warpflag.run.simulation import Simulation
 
-__all__ = ["Needed", "needed"]
+__all__ = ["MOVIE", "Needed", "needed", "stepping_time"]
 
 _SAMPLE_SECONDS = 0.3  # of computing: long enough to be timed to some per cent
 _MOST_SECONDS = 8.0  # of computing for all samples, so that the whole check takes some ten seconds
 _SETTLED = 4e-4  # simulated time [s] from which on steps have their usual length; those of the start are shorter
+_SHORTEST = 1e-9  # simulated time [s] that a sample is taken to have, where not one step came to its end
 _FRAMES_OBSERVED = 8  # frames whose observables are timed at once, as a run measures blocks of them
 _COLD = 6.0  # s of preparing, above which kernels have been compiled: with a warm cache it takes one
 _PER_FRAME = 1.5e-4  # s for the record of a frame; measured on zipping.toml
-_MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame; measured on zipping.toml
+MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame; measured on zipping.toml
 # Contacts ask for more and dearer steps. Time of stepping a whole run over what its first steps say, measured
 # (docs/tradeoff.md): at least, and at most with up to three flagella; with more that touch already.
 _LEAST_FACTOR, _FEW_FACTOR, _TOUCHING_FACTOR = 0.8, 1.4, 1.8
@@ -61,8 +63,12 @@ class Needed:
         return self.startup + self.sampled + self.crowd * self.rest + self.output
 
 
-def needed(simulation: Simulation) -> Needed:
+def needed(simulation: Simulation, most: float = _MOST_SECONDS) -> Needed:
     """Measured by starting the run; the simulation is advanced.
+
+    Args:
+        simulation: of one scene.
+        most: computing time of all samples [s].
 
     Raises:
         NumericalError: a guard is violated in the first steps.
@@ -73,11 +79,11 @@ def needed(simulation: Simulation) -> Needed:
     startup = time.process_time()
     compiling = startup - before if startup - before > _COLD else 0.0
     nodes = int(simulation.first_node[-1])
-    output = scene.frames * (_observing(simulation) + _PER_FRAME + _MOVIE_PER_NODE * nodes) + _MOVIE
+    output = scene.frames * (_observing(simulation) + _PER_FRAME + _MOVIE_PER_NODE * nodes) + MOVIE
     count = len(scene.resolved_flagella())
     few = count < 4
     crowd = _FEW_FACTOR if few or not scene.steric.enabled else 1 + _SLOPE * (min(count, _LARGEST_CROWD) - 2)
-    spent, rest = _stepping(simulation)
+    spent, rest = stepping_time(simulation, most)
     if simulation.cell_state().steric_force > 0.0:
         crowd = _FEW_FACTOR if few else _TOUCHING_FACTOR
     return Needed(startup - compiling, compiling, spent, rest, output, crowd)
@@ -96,20 +102,32 @@ def _observing(simulation: Simulation) -> float:
     return (time.process_time() - began) / _FRAMES_OBSERVED
 
 
-def _stepping(simulation: Simulation) -> tuple[float, float]:
+def stepping_time(simulation: Simulation, most: float) -> tuple[float, float]:
     """Seconds of computing that the sample took, and that the rest of the run takes at its last speed.
 
-    The sample is runs that double until one is long enough to time.
+    The sample is runs that double until one is long enough to time, or is cut off.
     """
     end = simulation.scenes[0].duration
     reached, spent = 0.0, 0.0
     until = min(_SETTLED / 4, end)
+    began = time.process_time()
+
+    def watch() -> None:
+        if time.process_time() - began + spent > most:
+            raise _Late
+
     while True:
         began = time.process_time()
-        simulation.advance(until)
+        with contextlib.suppress(_Late):
+            simulation.advance(until, watch)
         taken = time.process_time() - began
         spent += taken
+        stands = float(simulation.times[0])
         settled = reached >= _SETTLED and taken > _SAMPLE_SECONDS
-        if settled or until >= end or spent > _MOST_SECONDS:
-            return spent, taken / (until - reached) * (end - until)
-        reached, until = until, min(2 * until, end)
+        if settled or until >= end or spent > most:
+            return spent, taken / max(stands - reached, _SHORTEST) * max(end - stands, 0.0)
+        reached, until = stands, min(2 * until, end)
+
+
+class _Late(Exception):
+    """A sample has taken all of its time."""
