@@ -9,7 +9,7 @@ import numpy as np
 
 from warpflag.record import Record
 
-__all__ = ["check_frame", "check_values"]
+__all__ = ["check_frame", "check_shapes", "check_values"]
 
 _LAST_FORM = 2.0  # forms 0, 1 and 2 of polymorphs
 _AT_LEAST_0, _FROM_0_TO_1 = (0.0, math.inf), (0.0, 1.0)
@@ -40,6 +40,19 @@ _UNIT = ("chart.base_tangent", "chart.base_director", "chart.base_body_orientati
 _UNIT_BEFORE = ("frame.before_tangent", "frame.before_director", "frame.before_body_orientation")
 _UNIT_TOLERANCE = 1e-3  # of lengths and cosines; poses in float32 with segments of 0.01 um keep 1e-4
 _TIME_TOLERANCE = 1e-6  # of a frame interval: times this close are the same
+
+
+def check_shapes(arrays: Mapping[str, np.ndarray], own: Mapping[str, np.ndarray]) -> None:
+    """That the arrays of a checkpoint are those that a simulation has of its `own`.
+
+    Raises:
+        ValueError: they are not.
+    """
+    if own.keys() != arrays.keys():
+        raise ValueError("the checkpoint is of another version or another stepper")
+    for name, then in arrays.items():
+        if (then.shape, then.dtype) != (own[name].shape, own[name].dtype):
+            raise ValueError(f"the checkpoint is of other cells: {name} has shape {then.shape}, type {then.dtype}")
 
 
 def check_values(arrays: Mapping[str, np.ndarray], intervals: np.ndarray, anchors: np.ndarray) -> None:

@@ -25,7 +25,7 @@ from warpflag.model.starts import starting_states
 from warpflag.record import Frame, FrameRows
 from warpflag.record.cell_state import CellState, Evaluation
 from warpflag.record.reporters import Reporter, hand_over
-from warpflag.run.carried_values import check_values
+from warpflag.run.carried_values import check_shapes, check_values
 from warpflag.run.cells import Cells, CellsReader, evaluation_of
 from warpflag.run.faults import NumericalError, found_faults
 from warpflag.run.frames import Frames, finite_time
@@ -335,12 +335,7 @@ class Simulation:
             parts.get(name.partition(".")[0], {})[name.partition(".")[2]] = x
         if "before_position" in parts["frame"] and not self._frames.taken:
             self.take_frames()
-        own = self._memory()
-        if own.keys() != arrays.keys():
-            raise ValueError("the checkpoint is of another version or another stepper")
-        for name, then in arrays.items():
-            if (then.shape, then.dtype) != (own[name].shape, own[name].dtype):
-                raise ValueError(f"the checkpoint is of other cells: {name} has shape {then.shape}, type {then.dtype}")
+        check_shapes(arrays, self._memory())
         check_values(arrays, self._frames.intervals, self.first_node[:-1])
         for name, array in self.system.carried().items():
             array.assign(arrays[name])
