@@ -162,6 +162,12 @@ def test_a_worker_hands_back_what_is_not_done_with_the_bits_of_single_runs(tmp_p
             assert summary(alone)[name] == summary(directory)[name]
 
 
+def test_a_worker_ends_with_a_sweep_that_is_killed_in_the_middle_of_a_request():
+    """A batch is longer than a pipe holds, so that a killed sweep may leave a part of one."""
+    worker = [sys.executable, "-m", "warpflag.run.sweep.worker"]
+    subprocess.run(worker, input='{"batch": 1, "directories": ["a', text=True, stdout=subprocess.PIPE, timeout=120.0)
+
+
 @pytest.mark.parametrize(("seen", "expected"), [(0.0, 8e-5), (5e-5, 8e-5), (1.2e-4, 1.2e-4)])
 def test_members_that_ended_count_with_all_that_they_reached(seen, expected):
     """Whatever their worker last said of a batch: one is done, the other was stopped."""

@@ -75,12 +75,13 @@ def main() -> None:
 
 
 def _listen(stream: TextIO, requests: queue.Queue[dict[str, Any] | None], handed_back: set[int]) -> None:
-    for line in stream:
-        request = json.loads(line)
-        if "hand_back" in request:
-            handed_back.add(request["hand_back"])
-        else:
-            requests.put(request)
+    with contextlib.suppress(ValueError):  # of a request that was not written to its end: the sweep was killed
+        for line in stream:
+            request = json.loads(line)
+            if "hand_back" in request:
+                handed_back.add(request["hand_back"])
+            else:
+                requests.put(request)
     requests.put(None)
     os.kill(os.getpid(), signal.SIGTERM)  # ends what is running; without a run, the process
 
