@@ -30,9 +30,11 @@ traceback: more than the lines that a user should see, a crash, or no end.
 """
 ROOT = Path(__file__).parent.parent.parent
 PATIENCE = 600.0
-"""Wall time after which a command is taken to hang [s]."""
+"""Wall time after which a command is taken to hang [s]: on a busy machine one of seconds may take minutes."""
 LIFE = 1.05
-"""Times the undisturbed wall time of a command within which a signal comes: now and then it has ended before."""
+"""Times the undisturbed computing time of a command within which a signal comes: now and then it has ended before."""
+_SECONDS_PER_LOOK = 0.005  # at the computing time of a command that is to get a signal
+_TICKS = os.sysconf("SC_CLK_TCK")  # of Linux, in which it counts computing time, per second
 
 
 _PROBLEM = re.compile(r"warpflag: .+: .+")  # of a scene: its file, what is wrong
@@ -84,10 +86,15 @@ class Signalled:
 
 
 def signalled(arguments: Sequence[str], number: signal.Signals, after: float) -> Signalled | None:
-    """The command `warpflag` that gets a signal after so long [s]; None where it goes on for `PATIENCE` then."""
+    """The command `warpflag` that gets a signal after so much computing [s]; None where it goes on for `PATIENCE` then.
+
+    That of all its processes, which other work on the machine leaves alone: the moments are spread over its life.
+    """
     line = [sys.executable, "-m", "warpflag", *arguments]
     process = subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    time.sleep(after)
+    while process.poll() is None and computed(process.pid) < after:
+        time.sleep(_SECONDS_PER_LOOK)
+    time.sleep(after * _TICKS % 1.0 / _TICKS)  # anywhere between two ticks, also where it waits
     before = process.poll() is not None
     process.send_signal(number)
     try:
@@ -97,6 +104,28 @@ def signalled(arguments: Sequence[str], number: signal.Signals, after: float) ->
         process.wait()
         return None
     return Signalled(process.returncode, said, before)
+
+
+def computed(process: int) -> float:
+    """Computing time of a process and of those that it has started and not yet waited for [s]."""
+    total, left = 0.0, [process]
+    while left:
+        own = Path(f"/proc/{left.pop()}")
+        try:
+            total += sum(map(int, (own / "stat").read_text().rpartition(")")[2].split()[11:15])) / _TICKS
+            for task in (own / "task").iterdir():
+                left += map(int, (task / "children").read_text().split())
+        except OSError:  # it has ended
+            continue
+    return total
+
+
+def timed(*arguments: str) -> tuple[subprocess.CompletedProcess[str], float]:
+    """As `command`, and the computing time that it took [s]."""
+    before = os.times()
+    ended = command(*arguments)
+    after = os.times()
+    return ended, after.children_user + after.children_system - before.children_user - before.children_system
 
 
 def problem(ended: subprocess.CompletedProcess[str]) -> str:

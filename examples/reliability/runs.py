@@ -11,7 +11,19 @@ import sys
 import time
 from pathlib import Path
 
-from examples.reliability.attempt import LIFE, Found, command, found, frames_of, leading, problem, same, signalled, told
+from examples.reliability.attempt import (
+    LIFE,
+    Found,
+    command,
+    found,
+    frames_of,
+    leading,
+    problem,
+    same,
+    signalled,
+    timed,
+    told,
+)
 from examples.reliability.damage import damaged
 
 SCENE = """
@@ -55,9 +67,7 @@ class Base:
             ended = command("sweep", str(folder / "sweep.toml"), "-o", str(folder / "sweep"), "--set", "duration=1e-4")
             assert ended.returncode == 0, ended.stderr
         self.frames = frames_of(self.whole)
-        begin = time.monotonic()
-        command(*self.arguments(folder / "timed"))
-        self.seconds = time.monotonic() - begin
+        _, self.seconds = timed(*self.arguments(folder / "timed"))
         shutil.rmtree(folder / "timed", ignore_errors=True)
 
     def arguments(self, directory: Path) -> list[str]:

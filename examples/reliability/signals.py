@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import random
 import signal
-import time
 from pathlib import Path
 
-from examples.reliability.attempt import LIFE, Found, command, found, frames_of, problem, same, signalled, told
+from examples.reliability.attempt import LIFE, Found, command, found, frames_of, problem, same, signalled, timed, told
 from examples.reliability.runs import CHECKPOINTS, Base
 
 NUMBERS = (signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGXCPU, signal.SIGINT)
@@ -20,16 +19,15 @@ OPTIONS = ("--workers", "1", *CHECKPOINTS)
 
 
 def _undisturbed(base: Base) -> tuple[Path, float]:
-    """A sweep that nobody disturbs, made once, and the wall time that it takes now [s]."""
+    """A sweep that nobody disturbs, made once, and the computing time that it takes [s]."""
     plan, whole = base.folder / "signals.toml", base.folder / "swept"
-    timed = base.folder / "swept.seconds"
-    if not timed.exists():
+    taken = base.folder / "swept.seconds"
+    if not taken.exists():
         plan.write_text(SWEEP.format(base=base.scene))
-        begin = time.monotonic()
-        ended = command("sweep", str(plan), "-o", str(whole), *OPTIONS)
+        ended, seconds = timed("sweep", str(plan), "-o", str(whole), *OPTIONS)
         assert ended.returncode == 0, ended.stderr
-        timed.write_text(f"{time.monotonic() - begin}")
-    return whole, float(timed.read_text())
+        taken.write_text(f"{seconds}")
+    return whole, float(taken.read_text())
 
 
 def asked_to_end(base: Base, seed: int, folder: Path) -> Found:
