@@ -7,6 +7,7 @@ import json
 import math
 import re
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +37,14 @@ def test_members_are_all_combinations_in_order(folder):
     assert [m.scene.name for m in found][:2] == ["sweep-0000", "sweep-0001"]
     assert (found[4].scene.motor.torque, found[4].scene.flagella.opening_angle) == (2.0, 65.0)
     assert found[4].scene.flagella.length == 2.0  # the base's
+
+
+def test_the_sweep_file_of_the_documentation_is_sound(tmp_path):
+    root = Path(__file__).parents[3]
+    (block,) = re.findall(r"```toml\n(base = .*?)```", (root / "docs" / "sweeps.md").read_text(encoding="utf-8"), re.S)
+    (tmp_path / "zipping.toml").write_bytes((root / "examples" / "zipping.toml").read_bytes())
+    (tmp_path / "sweep.toml").write_text(block.replace("draws = 16", "draws = 1"))
+    assert len(read(tmp_path / "sweep.toml").members()) == 8 * 2 * 3
 
 
 def test_the_command_line_replaces_axes_and_values(folder):
