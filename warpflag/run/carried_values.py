@@ -12,7 +12,7 @@ from warpflag.record import Record
 __all__ = ["check_frame", "check_shapes", "check_values"]
 
 _LAST_FORM = 2.0  # forms 0, 1 and 2 of polymorphs
-_AT_LEAST_0, _FROM_0_TO_1 = (0.0, math.inf), (0.0, 1.0)
+_AT_LEAST_0, _FROM_0_TO_1 = (0.0, math.inf), (0.0, 1.0)  # least and greatest value of an array
 _NOT_BELOW_0 = (
     *("control.time", "control.steps", "frame.time", "frame.before_step_before", "stepper.evaluations"),
     *("stepper.last_step", "stepper.step_before", "stepper.wanted_step", "stepper.rejected", "stepper.noise_products"),
