@@ -46,6 +46,10 @@ _ADVICE = {
         "the fixed step is beyond what its stages keep stable",
         "take a shorter numerics.time_step, or leave it out",
     ),
+    Fault.PRESSED: (
+        "a contact is closer than noise or motors can press it: a step has missed it",
+        "filaments that touch ask for a numerics.time_step of 1e-6 or less",
+    ),
     Fault.CROWDED: ("more contacts at once than a step has room for", "take numerics.stepper = rkc"),
 }
 _OF_CELL = (Fault.UNSOLVED, Fault.ACCURACY, Fault.BALANCE, Fault.UNSTABLE, Fault.CROWDED)

@@ -220,6 +220,7 @@ class ThermalStepper:
         model, state, share = s.model, s.state, (2.0 * equilibrium.IMPLICITNESS - 1.0) ** 0.5
         if self._touching:
             search.find(model, state, state.data.pose, parts.contacts)
+            closing.check_gaps(model, state, parts.contacts, self.noise, s.control)
             contact_solve.warm_start(model, state, self._no_share, self._x, parts.contacts, parts.law)
             parts.law.force.zero_()  # velocities are found without contacts: their closest points are yet to change
         if self._flows:

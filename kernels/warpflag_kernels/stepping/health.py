@@ -45,6 +45,7 @@ class Fault(IntEnum):
     BALANCE = 8
     UNSTABLE = 9
     CROWDED = 10
+    PRESSED = 11
 
 
 def encode(kind: Fault) -> int:

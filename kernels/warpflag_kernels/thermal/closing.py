@@ -9,6 +9,9 @@ The contact solve has P g M B for the response to forces, with the matrix of the
 full mobility, which changes the gaps, most where a contact is stiff over the step. So contact forces are found once
 more at the pose to which that leads, from the increment less the response to the first ones, and GMRES solves for the
 response to their change, in cells that have a contact.
+
+A step that moves a filament sideways by as much as a contact is wide leads elsewhere than its gaps foretell, and two
+filaments may end within each other's width without having crossed. `check_gaps` stops such cells.
 """
 
 import functools
@@ -17,13 +20,22 @@ from typing import Any
 
 import warp as wp
 
+from warpflag_kernels.base.clock import Control
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
-from warpflag_kernels.contact import contact_list, search
+from warpflag_kernels.contact import contact_list, search, steric
+from warpflag_kernels.contact.constants import LINEAR_BELOW
+from warpflag_kernels.fluid import noise as noise_stage
 from warpflag_kernels.implicit import delassus
 from warpflag_kernels.implicit import stability as stability_stage
 from warpflag_kernels.rod import chain_chart, reconstruction
+from warpflag_kernels.stepping.health import Fault, encode
 from warpflag_kernels.thermal import additive_chart
+
+# What neither noise nor motors bring about: contacts closer than 0.75 sigma, where the force is 76 F_0, with an energy
+# above 30 kT.
+LEAST_GAP = 0.75
+LARGEST_ENERGY = 30.0
 
 
 @functools.cache
@@ -31,7 +43,10 @@ def _kernels(p: Precision) -> SimpleNamespace:
     real = p.real
     Model, State, Stability = structs(p).Model, structs(p).State, stability_stage.struct(p)
     Contacts, Law, Increment = contact_list.struct(p), delassus.struct(p), chain_chart.types(p).Increment
-    gap_change = contact_list.functions(p).gap_change
+    Noise = noise_stage.struct(p)
+    gap_change, steric_force = contact_list.functions(p).gap_change, steric.functions(p).steric_force
+    least_gap, linear_below = wp.constant(real(LEAST_GAP)), wp.constant(real(LINEAR_BELOW))
+    largest_energy, pressed = wp.constant(wp.float64(LARGEST_ENERGY)), wp.constant(wp.int32(encode(Fault.PRESSED)))
     module = p.module("closing")
 
     @wp.kernel(module=module)
@@ -126,7 +141,35 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if e == model.first_node[model.first_flagellum[c]]:
             out.body[c] = out.body[c] + x.body[c]
 
-    return SimpleNamespace(mark=mark, take_back=take_back, look=look, difference=set_difference, add=add)
+    @wp.kernel(module=module)
+    def check_gaps(
+        # Model:
+        model: Model,
+        # State:
+        state: State,
+        contacts_in: Contacts,
+        noise: Noise,
+        # Out:
+        control: Control,
+    ):
+        c = wp.tid()
+        if state.active[c] == 0 or control.steps[c] == 0:
+            return
+        strength = model.steric.strength[c]
+        diameter = model.steric.diameter[c]
+        i = contacts_in.first[c]
+        while i < contacts_in.first[c] + contacts_in.count[c]:
+            gap = contacts_in.gap[i]
+            if gap < least_gap * diameter:
+                # Of the law's steep part, F_0 sigma (sigma/r)^12/6, it is F r/12.
+                energy = steric_force(gap, strength, diameter) * wp.max(gap, linear_below * diameter) / real(12.0)
+                if wp.float64(energy) > largest_energy * noise.energy[c]:
+                    wp.atomic_min(control.fault, c, pressed + contacts_in.segment[i])
+            i += 1
+
+    return SimpleNamespace(
+        mark=mark, take_back=take_back, look=look, difference=set_difference, add=add, check_gaps=check_gaps
+    )
 
 
 def mark(model: DeviceModel, state: DeviceState, contacts: Any, law: Any, stability: Any, anew: bool) -> None:
@@ -145,6 +188,20 @@ def renew(model: DeviceModel, state: DeviceState, chart: Any, x: Any, work: Any,
     reconstruction.go_back(model, state, chart)
     inputs = [model.data, state.data, x, contacts, law]
     wp.launch(kernels.take_back, model.cell_count, inputs=inputs, device=device)
+
+
+def check_gaps(model: DeviceModel, state: DeviceState, contacts: Any, noise: Any, control: Any) -> None:
+    """Stops cells with a contact at the start of a step, their first one excepted, that is closer than noise or motors
+    can press it.
+
+    Args:
+        model, state: of the batch.
+        contacts: struct `Contacts`, found at this pose.
+        noise: struct `Noise`.
+        control: struct `Control`.
+    """
+    inputs = [model.data, state.data, contacts, noise, control]
+    wp.launch(_kernels(model.precision).check_gaps, model.cell_count, inputs=inputs, device=model.device)
 
 
 def set_difference(model: DeviceModel, state: DeviceState, x: Any, y: Any, out: Any) -> None:
