@@ -3,7 +3,7 @@
     uv run --extra plot examples/thermal/noisy_zip.py --seeds 64 -o noisy_zip.png --times noisy_zip.csv
     uv run --extra plot examples/thermal/noisy_zip.py --from noisy_zip.csv -o noisy_zip.png      # the picture alone
 
-A batch per torque, whose cells leave it when their bundle is complete; steps of 2 to 5 us. Beside them the zip time
+A batch per torque, whose cells leave it when their bundle is complete; steps of 2 us. Beside them the zip time
 without noise. Without an output no picture is drawn.
 """
 
@@ -20,7 +20,7 @@ import warpflag
 from warpflag import Simulation, observables, with_values
 
 # Torque [pN um], duration, step, and interval of the looks [s].
-RUNS = ((3.4, 0.015, 2e-6, 5e-5), (1.0, 0.08, 5e-6, 1e-4), (0.5, 0.6, 5e-6, 5e-4))
+RUNS = ((3.4, 0.015, 2e-6, 5e-5), (1.0, 0.08, 2e-6, 1e-4), (0.5, 0.6, 2e-6, 5e-4))
 SCENE = Path(__file__).parent.parent / "noisy_zip.toml"
 COLUMNS = ("torque [pN um]", "seed", "zipped [ms]")
 QUIET = -1  # in place of a seed: without noise

@@ -88,6 +88,7 @@ def test_goes_on_with_the_same_bits(device):
     [
         ({"motor.law": "torque_speed", "numerics.stepper": "euler", "numerics.time_step": 1e-9}, "numerics.stepper"),
         ({"motor.switching": "markov", "numerics.stepper": "euler", "numerics.time_step": 1e-9}, "numerics.stepper"),
+        ({"motor.switching": "markov", "numerics.stepper": "rkc", "numerics.time_step": 1e-9}, "numerics.stepper"),
         ({"polymorphs.enabled": True}, "polymorphs.enabled"),
     ],
 )

@@ -242,9 +242,9 @@ class Scene(Section, key=""):
             return
         mode, numerics = self.hydrodynamics.mode, self.numerics
         plain = self.motor.switching == "none" and all(spec.law == "constant" for spec in self.resolved_flagella())
-        if numerics.stepper == "euler" and not plain:
+        if numerics.stepper != "implicit" and not plain:
             problem = f"must be implicit with {key} and motors that switch or whose law is not constant"
-            raise SceneError("numerics.stepper", "euler", problem, [key, "motor.law", "motor.switching"])
+            raise SceneError("numerics.stepper", numerics.stepper, problem, [key, "motor.law", "motor.switching"])
         if self.polymorphs.enabled:
             problem = (
                 f"must be false with {key}: forms change by moments without noise, which alone is 0.3 pN um a joint"
@@ -253,8 +253,6 @@ class Scene(Section, key=""):
         if mode in ("between", "as_printed"):
             problem = f"must be none, within, all or consistent with {key}: its mobility is not positive definite"
             raise SceneError("hydrodynamics.mode", mode, problem, related)
-        if numerics.stepper == "rkc":
-            raise SceneError("numerics.stepper", "rkc", f"takes no {key}; implicit and euler do", related)
         if numerics.accuracy is not None:
             problem = f"must be absent with {key}: steps with noise are fixed, numerics.time_step"
             raise SceneError("numerics.accuracy", numerics.accuracy, problem, related)

@@ -28,7 +28,7 @@ def make_stepper(system: System, scenes: Sequence[Scene]) -> Stepper:
     if system.model.switches.noise:
         from warpflag.stepping.thermal import ThermalStepper
 
-        return ThermalStepper(system, scenes, explicit=names == {"euler"})
+        return ThermalStepper(system, scenes, name=names.pop())
     if names == {"implicit"}:
         return ImplicitStepper(system, scenes)
     return RkcStepper(system, scenes, euler=names == {"euler"})

@@ -85,6 +85,7 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
         band: Band,
         noise: Noise,
         step: wp.array(dtype=wp.float64),
+        share: real,
         # Out:
         x: Increment,
     ):
@@ -104,10 +105,10 @@ def _kernels(p: Precision, explicit: bool) -> SimpleNamespace:
             w = state.body_spin[c]
             b = vec6(u[0], u[1], u[2], w[0], w[1], w[2]) + noise.body[c]
             if wp.static(explicit):
-                b = real(step[c]) * b
+                b = share * real(step[c]) * b
             x.body[c] = b
         if wp.static(explicit):
-            dt = real(step[c])
+            dt = share * real(step[c])
             x.node[e] = vec4(dt * v[0], dt * v[1], dt * v[2], dt * spin)
         else:
             if e > model.first_node[k]:
@@ -209,9 +210,12 @@ def begin_step(model: DeviceModel, state: DeviceState, s: Any, explicit: bool) -
     wp.launch(kernels.begin, model.cell_count, inputs=inputs, device=device)
 
 
-def right_hand_side(model: DeviceModel, state: DeviceState, s: Any, noise: Any, x: Any, explicit: bool) -> None:
-    """From velocities and thermal velocities to the right side of the linear system; explicit: to the increment."""
-    inputs = [model.data, state.data, s.band, noise, s.control.step, x]
+def right_hand_side(
+    model: DeviceModel, state: DeviceState, s: Any, noise: Any, x: Any, explicit: bool, share: float = 1.0
+) -> None:
+    """From velocities and thermal velocities to the right side of the linear system; explicit: to the increment, of a
+    share of the step."""
+    inputs = [model.data, state.data, s.band, noise, s.control.step, share, x]
     kernel = _kernels(model.precision, explicit).right_hand_side
     wp.launch(kernel, model.element_count, inputs=inputs, device=model.device)
 

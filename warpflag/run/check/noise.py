@@ -23,7 +23,11 @@ def of_noise(scene: Scene, step: float) -> list[str]:
     long = spec.length * _axial_share(scene)
     drag = long**3 / (3 * mobility.across * spec.segment_length)
     tip = long * math.sqrt(4 * energy / drag * scene.duration)
-    method = "Euler-Maruyama" if numerics.stepper == "euler" else "linearly implicit with a random elastic force"
+    method = {
+        "euler": "Euler-Maruyama",
+        "rkc": "RKC of two stages, the noise held over a step",
+        "implicit": "linearly implicit with a random elastic force",
+    }[numerics.stepper]
     return [
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
         "joints err by up to 1 % at 1e-5 s, gaps of contacts by 5 % at 1e-6 s, driven motion in proportion to the "
