@@ -10,7 +10,7 @@ import pytest
 
 from tests.runs import small, summary
 from warpflag.run import execute, run
-from warpflag.run.growth import FOLLOWED, Growth, chosen, growth, growth_words
+from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, Growth, chosen, growth, growth_words
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended
 from warpflag.scene import paper_scene, with_values
@@ -127,7 +127,7 @@ def test_growth_at_a_known_rate_is_found(monkeypatch):
 def test_a_run_is_followed_where_its_estimate_is_high(tmp_path, monkeypatch):
     asked = []
 
-    def found(scene, states, first_node, device, step, patience, check):
+    def found(scene, states, first_node, device, step, patience, followed, check):
         assert 1e-9 < step < 1e-5
         asked.append((scene.name, [state.time for state in states], list(first_node), device))
         return Growth(5e3, 1e-5, 2e-5)
@@ -140,7 +140,39 @@ def test_a_run_is_followed_where_its_estimate_is_high(tmp_path, monkeypatch):
         achieved.worst.fill_(1e3 * share)
         message = started.execute(quiet=True).message
         assert ("unstable motion: a disturbance grows 5e+03 times" in message) == (name == "high")
-        expected = {"factor": 5e3, "from": 1e-5, "within": 2e-5} if name == "high" else None
+        expected = {"factor": 5e3, "from": 1e-5, "within": 2e-5, "between": 1.0} if name == "high" else None
         assert summary(tmp_path / name)["growth"] == expected
     assert [(name, nodes, device) for name, _, nodes, device in asked] == [("small", [0, 11, 22], "cpu")]
     assert asked[0][1][-1] > 0.0 in asked[0][1]
+
+
+def test_what_grows_after_the_disturbance_has_relaxed_is_lively(monkeypatch):
+    """A distance that at first falls to a tenth, and then grows from look to look."""
+    scales = {1: 1.0, 2: 0.4, 3: 0.1, 4: 0.1, 5: 0.2, 6: 0.4, 7: 0.8, 8: 0.75, 9: 0.7, 10: 0.6}
+    parting(monkeypatch, lambda until: scales[round(10 * until / FOLLOWED_IN_CROWDS)])
+    nodes, step = np.array([0, 11, 22]), 2e-7
+    found = growth(small(), [still(1e-3)], nodes, "cpu", step, followed=FOLLOWED_IN_CROWDS)
+    assert found is not None and not found.unstable and found.lively and found.between == pytest.approx(8.0)
+    assert "lively motion: a disturbance grows 8 times in 0.175 ms from 1 ms on" in growth_words(found)
+    # One that falls for good, or grows in the disturbance's own relaxation alone, is not.
+    parting(monkeypatch, lambda until: 9.0 - until / FOLLOWED)
+    relaxing = growth(small(), [still(1e-3)], nodes, "cpu", step)
+    assert relaxing is not None and not relaxing.lively and growth_words(relaxing) == ""
+
+
+@pytest.mark.parametrize(("count", "share", "expected"), [(3, 3.0, 0), (4, 3.0, 1), (4, 1.5, 0), (3, 6.0, 3)])
+def test_a_crowd_is_followed_sooner_but_from_one_frame(count, share, expected, tmp_path, monkeypatch):
+    asked = []
+
+    def found(scene, states, first_node, device, step, patience, followed, check):
+        asked.extend([followed] * len(list(states)))
+
+    monkeypatch.setattr(execute, "growth", found)
+    values = {"numerics.on_accuracy": "warn", "flagella.count": count, "duration": 4e-5, "frames": 4}
+    started = run.start(small(values), str(tmp_path / "made"), "cpu", movies=False)
+    achieved = started.simulation.stepper.steps.achieved
+    achieved.window_time.fill_(-1.0)
+    achieved.worst.fill_(share)
+    achieved.worst_end.fill_(1.3e-4)
+    started.execute(quiet=True)
+    assert asked == [FOLLOWED_IN_CROWDS if expected == 1 else FOLLOWED] * expected

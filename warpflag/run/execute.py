@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,13 +19,13 @@ from warpflag.base.streams import tell
 from warpflag.record import FrameRows, Record, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
-from warpflag.run.growth import PATIENCE, Growth, chosen, growth
+from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, PATIENCE, Growth, chosen, growth
 from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.summary import accuracy_kept
 
-__all__ = ["SUSPECT", "Run"]
+__all__ = ["SUSPECT", "SUSPECT_OF_CROWDS", "Run"]
 
 _CHECKPOINT_SECONDS = 5.0  # wall time between two checkpoints: what a killed run computes again
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
@@ -33,6 +34,8 @@ _WRITERS = 2  # threads that write files: one computes while the other waits for
 # Estimate of the worst window over the accuracy from which on a run is followed by disturbed copies (`growth`); windows
 # of sound zipping runs reach four.
 SUSPECT = 5.0
+# The same of more than `_FEW_FLAGELLA`, which slip past each other: it is followed from the frame before that window.
+SUSPECT_OF_CROWDS, _FEW_FLAGELLA = 2.0, 3
 
 
 class Run:
@@ -188,17 +191,20 @@ class Run:
     def _finish(self, cell: int, status: str, facts: Mapping[str, Any], fault: NumericalError | None) -> None:
         """Ends a member; where its estimates are high, or a guard has stopped it, disturbed copies are followed."""
         member, kept = self.members[cell], facts["accuracy"]
-        high = kept["worst_window"] is not None and kept["worst_window"] > SUSPECT * kept["asked"]
+        worst = (kept["worst_window"] or 0.0) / kept["asked"]
+        high = worst > SUSPECT
+        crowd = worst > SUSPECT_OF_CROWDS and len(member.scene.resolved_flagella()) > _FEW_FLAGELLA
 
         def follow(record: Record) -> Growth | None:
             # Members of a batch share the time that one run may take.
             patience = PATIENCE - self._following
-            if not (high or fault) or patience <= 0.0:
+            if not (high or crowd or fault) or patience <= 0.0:
                 return None
             began, device = process_time(), self.simulation.device.alias
-            frames = chosen(record, kept["worst_window_end"])
+            followed, most = (FOLLOWED, None) if high or fault else (FOLLOWED_IN_CROWDS, 1)
+            frames = itertools.islice(chosen(record, kept["worst_window_end"], followed), most)
             step = 0.5 * self._copied_times()[cell] / max(int(facts["steps"]), 1)
-            found = growth(member.scene, frames, record.first_node, device, step, patience, self._check)
+            found = growth(member.scene, frames, record.first_node, device, step, patience, followed, self._check)
             self._following += process_time() - began
             return found
 

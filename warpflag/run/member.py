@@ -203,7 +203,9 @@ class Member:
             return f"{how} before the first frame; start again with --resume {self.directory}"
         with Record(self.directory) as record:
             found, grown, taken = digest(record, self.scene, self.recorder.kept()), follow(record), self.wall_time
-            growth = {"factor": grown.factor, "from": grown.start, "within": grown.within} if grown else None
+            growth = None
+            if grown:
+                growth = {"factor": grown.factor, "from": grown.start, "within": grown.within, "between": grown.between}
             ending = {"status": status, "message": str(fault) if fault else "", "wall_time": taken}
             summary = {**ending, "scene_sha256": self.recorder.scene_sha256, **facts, "growth": growth, **found}
             write_whole(self.directory / SUMMARY_NAME, json.dumps(plain(summary), indent=2) + "\n")
