@@ -69,18 +69,18 @@ def test_energies_are_those_of_boltzmann(step, count, mode, hook, precision, dev
     assert np.all(abs(mean - 1) < ERRORS * error)
 
 
-def test_with_flow_round_the_body(device):
+def test_with_flow_round_the_body(precision, device):
     values = {"numerics.time_step": 1e-5, "hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": True}
-    sim, scene = ensemble({**values, "hydrodynamics.body_beads": 30}, "float64", 64, device)
+    sim, scene = ensemble({**values, "hydrodynamics.body_beads": 30}, precision, 64, device)
     mean, error = mean_energies(sim, scene, 2e-4, 2e-5, 30)
     assert np.all(error < 0.03)
     assert np.all(abs(mean - 1) < ERRORS * error)
 
 
 @pytest.mark.parametrize("mode", ["none", "all"])
-def test_a_free_filament_has_them_too(mode, device):
+def test_a_free_filament_has_them_too(mode, precision, device):
     values = {"numerics.time_step": 1e-5, "flagella.count": 1, "hydrodynamics.mode": mode, "body.enabled": False}
-    sim, scene = ensemble(values, "float64", 64, device)
+    sim, scene = ensemble(values, precision, 64, device)
     mean, error = mean_energies(sim, scene, 2e-4, 2e-5, 30)
     assert np.all(error < 0.03)
     assert np.all(abs(mean - 1) < ERRORS * error)

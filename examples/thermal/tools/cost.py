@@ -15,6 +15,8 @@ from .joints import FLOW, HOOKED
 
 CASES = (
     ("two flagella, the paper's model", {}),
+    ("three flagella", {"flagella.count": 3}),
+    ("eight flagella", {"flagella.count": 8}),
     ("two flagella, flow round the body, hooks", {**FLOW, **HOOKED}),
 )
 
