@@ -81,6 +81,8 @@ def test_noise_turns_a_filament_as_rotational_diffusion_does():
     assert found is not None and float(found[1]) == pytest.approx(tip, rel=0.05)
     assert float(found[2]) == pytest.approx(tip * math.sqrt(1e-3), rel=0.5)
     assert of_noise(small(), 1e-6) == []
+    assert "miss contacts" in of_noise(scene, 5e-6)[-1]
+    assert len(of_noise(with_values(scene, {"steric.enabled": False}), 5e-6)) == 2
 
 
 @pytest.mark.parametrize("duration", [2e-4, 2e-3, 0.5])

@@ -11,6 +11,9 @@ from warpflag.scene.resistance import filament_mobility, thermal_energy
 
 __all__ = ["of_noise"]
 
+SOUND_IN_CONTACT = 2.0e-6
+"""Longest step that has missed no contact of two filaments that lie side by side [s]."""
+
 
 def of_noise(scene: Scene, step: float) -> list[str]:
     """What thermal noise does to a run and asks of its step; nothing without a temperature."""
@@ -28,13 +31,20 @@ def of_noise(scene: Scene, step: float) -> list[str]:
         "rkc": "RKC of two stages, the noise held over a step",
         "implicit": "linearly implicit with a random elastic force",
     }[numerics.stepper]
-    return [
+    said = [
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
         "joints err by up to 1 % at 1e-5 s, gaps of contacts by 5 % at 1e-6 s, driven motion in proportion to the "
         "step: halve it and compare",
         f"noise alone turns a flagellum about its hook: tip by about {tip:.2g} um in {1e3 * scene.duration:g} ms, "
         f"{tip * math.sqrt(step / scene.duration):.1g} um in a step",
     ]
+    several = len(scene.resolved_flagella()) > 1
+    if step > SOUND_IN_CONTACT and scene.steric.enabled and (several or scene.steric.self_contact):
+        said.append(
+            f"steps of {step:g} s miss contacts now and then where filaments touch, and the run stops when one does: "
+            f"take numerics.time_step = {SOUND_IN_CONTACT:g} or less"
+        )
+    return said
 
 
 def _axial_share(scene: Scene) -> float:
