@@ -27,7 +27,7 @@ CELLS = {  # flagella, body length [um], viscosity over that of water, and what 
     "number": [(2, 2.5, 1, "22.4, body 30"), (5, 2.5, 1, "26.6, body 37"), (8, 2.5, 1, "24.7, body 38")],
     "length": [(number, float(number), 1, "the same speed for all") for number in (2, 3, 4, 5, 6)],
     "viscosity": [
-        (number, 2.5, viscosity, "") for viscosity in (1, 2, 4, 8) for number in (1, 2, 3, 4, 6, 8, 10, 12, 16)
+        (number, 2.5, viscosity, "") for viscosity in (1, 2, 4, 8) for number in (1, 2, 3, 4, 6, 8, 10, 12, 14, 16)
     ],
 }
 

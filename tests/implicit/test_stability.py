@@ -169,7 +169,7 @@ def test_a_step_begins_with_no_more_than_keeps_slow_modes_damped(device, precisi
 
 
 def test_kappa_is_measured_while_a_flagellum_turns(device):
-    """As at a standstill, where that takes some twenty products; and so its energy is steady, on a fine mesh too."""
+    """Not half of what it is at a standstill; and steps are stable, so that its energy is steady, on a fine mesh too."""
     values = {"flagella.count": 1, "flagella.segment_length": 0.05, "flagella.length": 6.0, "body.anchored": True}
     values |= {"flagella.opening_angle": 0.0, "flagella.on_axis": True, "flagella.anchor_offset": 1.2}
     sim = Simulation(
@@ -189,7 +189,7 @@ def test_kappa_is_measured_while_a_flagellum_turns(device):
             system.control.longest_step,
         )  # fmt: skip
     at_rest = float(s.stability.kappa.numpy()[0])
-    assert max(measured) == pytest.approx(at_rest, rel=0.15) and at_rest > 2.2
+    assert 0.75 * at_rest < max(measured) < 1.1 * at_rest and at_rest > 2.2
     assert np.std(energies) < 5e-3 * np.mean(energies)  # 3e-2 where kappa is missed
 
 

@@ -240,6 +240,23 @@ def test_the_second_form_comes_at_its_rate_while_a_motor_winds_up():
     assert np.mean(begun) == pytest.approx(0.5, abs=4 * 0.5 / 20)
 
 
+def test_the_second_form_goes_by_the_sense_of_a_prescribed_rate():
+    """The torque of a motor that turns at a given rate says nothing of its sense."""
+    values = {"polymorphs.second": "curly_1", "polymorphs.second_rate": 1e3, "motor.law": "rate", "motor.torque": 3.4}
+    forward, reverse = (
+        switching.second_intervals(cell({**FORMS, **values, "motor.rate": rate}), 0) for rate in (50.0, -50.0)
+    )
+    assert forward == () and len(reverse) == 1
+
+
+@pytest.mark.parametrize("strain", [(0.0, 0.0, 0.0), (0.0, 1.3, 0.0)])
+def test_filaments_without_a_hand_have_no_polymorphs(strain):
+    """Straight ones, or flat ones: no sense of a motor is against a handedness of theirs, and none ever flipped."""
+    with pytest.raises(SceneError, match=r"polymorphs.enabled .* no handedness.*flagella.intrinsic_curvature"):
+        cell({**FORMS, "flagella.intrinsic_curvature": strain})
+    cell({**FORMS, "flagella.intrinsic_curvature": (0.0, 0.0, 1e-3)})
+
+
 def test_radius_and_pitch_give_curvature_and_torsion():
     radius, pitch = 1.3 / (1.3**2 + 2.1**2), -2.1 * 2 * np.pi / (1.3**2 + 2.1**2)
     scene = cell({"flagella.helix_radius": radius, "flagella.helix_pitch": pitch})

@@ -172,6 +172,9 @@ def test_the_time_is_a_range_of_its_parts():
     assert "Reynolds number" in said
 
 
+REVERSING = {"motor.switching": "markov", "motor.to_reverse": 1e4}  # within any run
+
+
 @pytest.mark.parametrize(
     "values, word",
     [
@@ -184,12 +187,19 @@ def test_the_time_is_a_range_of_its_parts():
             None,  # forward winds up
         ),
         ({"motor.torque": 1.2, "motor.switching": "schedule"}, "against the handedness"),
-        ({"motor.torque": 1.2, "motor.switching": "schedule", "motor.switch_times": (1e-3,)}, None),
-        ({"motor.switching": "markov", "motor.reverse_torque": 0.9}, "beyond 0.9 pN um, below"),
-        ({"motor.switching": "markov", "motor.torque": 1.3, "motor.law": "torque_speed"}, "1.3 only while they switch"),
+        ({"motor.torque": 1.2, "motor.switching": "schedule", "motor.switch_times": (1e-5,)}, None),
+        ({**REVERSING, "motor.reverse_torque": 0.9}, "beyond 0.9 pN um, below"),
+        ({**REVERSING, "motor.torque": 1.3, "motor.law": "torque_speed"}, "1.3 only while they switch"),
         ({"motor.torque": -1.0, "polymorphs.nucleation": 0.9}, None),
         ({"motor.torque": -1.0, "polymorphs.enabled": False}, None),
-        ({"motor.law": "rate"}, None),
+        ({"motor.law": "rate"}, "against the handedness"),
+        ({"motor.law": "rate", "motor.rate": -50.0}, None),
+        ({"motor.law": "rate", "motor.rate": 0.0, "motor.torque": -2.0}, "against the handedness"),
+        ({"motor.switching": "schedule", "motor.switch_times": (1e-3,), "duration": 1e-3}, "within the run"),
+        ({"motor.switching": "markov", "duration": 1e-3}, "within the run"),
+        ({"body.enabled": False, "flagella.count": 1, "motor.torque": -3.4}, "without a body"),
+        ({"motor.torque": -3.4, "polymorphs.semicoiled": (0.0, 1.3, -2.1)}, "is the ground state"),
+        ({"motor.torque": 1.2, "flagella.intrinsic_curvature": (0.0, 0.0, 2.1)}, None),  # straight, but it has a hand
     ],
 )
 def test_polymorphs_that_no_motor_can_reach_are_told(values, word):
@@ -201,7 +211,7 @@ def test_polymorphs_that_no_motor_can_reach_are_told(values, word):
 
 def test_the_torque_on_a_curve_is_where_it_meets_the_drag():
     """Steady in reverse on the straight line of its curve: told to within its printed digits."""
-    values = {"motor.torque": 3.0, "motor.law": "torque_speed", "motor.switching": "markov", "flagella.length": 6.0}
+    values = {"motor.torque": 3.0, "motor.law": "torque_speed", **REVERSING, "flagella.length": 6.0}
     scene = small({"polymorphs.enabled": True, "polymorphs.nucleation": 2.9, **values})
     stiff = turning(scene)
     (line,) = of_polymorphs(scene, stiff)

@@ -64,7 +64,7 @@ def second_intervals(scene: Scene, motor: int) -> tuple[tuple[float, float], ...
     forms = scene.polymorphs
     if forms.second == "none" or forms.second_rate <= 0.0:
         return ()
-    winds_up = scene.resolved_flagella()[motor].torque * scene.flagella.ground_strain[2] > 0.0
+    winds_up = scene.resolved_flagella()[motor].forward * scene.flagella.ground_strain[2] > 0.0
     ends = [0.0, *switch_times(scene, motor), math.inf]
     delays = _ticks(scene.motor.seed, _SECOND_STREAMS + motor, forms.second_rate, 0, math.inf)
     found, last = [], 0.0

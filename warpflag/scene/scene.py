@@ -69,6 +69,11 @@ class FlagellumSpec:
     switch_times: tuple[float, ...]
 
     @property
+    def forward(self) -> float:
+        """Of the sign in which the motor turns forward, right-handed about its axis; 0 for one that is never driven."""
+        return self.rate if self.law == "rate" else self.torque
+
+    @property
     def segment_length(self) -> float:
         """Rest length h of a segment [um]: the contour length over the number of segments."""
         return self.length / self.segment_count
@@ -265,10 +270,15 @@ class Scene(Section, key=""):
             raise SceneError("start.frame", self.start.frame, "needs start.record, which is absent")
 
     def _check_forms(self) -> None:
-        """A joint must not flip back under the moment that it flips at, or it would go to and fro for ever."""
+        """Moments count against a handedness; a joint must not flip back under that at which it flips, to and fro."""
         forms = self.polymorphs
         if not forms.enabled:
             return
+        if self.flagella.ground_strain[2] == 0.0:
+            key = "intrinsic_curvature" if self.flagella.helix_pitch is None else "helix_pitch"
+            part = "the third component of " if self.flagella.helix_pitch is None else ""
+            problem = "must be false where filaments have no handedness, against which motors could wind them up: "
+            raise SceneError("polymorphs.enabled", True, f"{problem}{part}flagella.{key} is 0", [f"flagella.{key}"])
         for name, back, limit in (
             ("propagation", forms.propagation_back, forms.propagation),
             ("nucleation", -forms.nucleation_back, forms.nucleation),

@@ -257,7 +257,8 @@ class ImplicitStepper:
 
     def restart(self) -> None:
         counts = np.diff(self._system.model.data.first_flagellum.numpy())
-        self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, stability.LEAST_OVER_IMPLICIT))
+        few = stability.LEAST_OVER_IMPLICIT if self.stability is None else self.stability.least.numpy()
+        self.data.over_implicit.assign(np.where(counts > 2, OVER_IMPLICIT_CROWD, few))
         self.data.history.zero_()
         self.data.share.zero_()
         self.balance.known.zero_()

@@ -49,8 +49,8 @@ TIGHT = 10.0
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
 LONG_INTERVAL = 32  # the same for one or two flexible flagella of small kappa
 FIRST_OF_FLEXIBLE = 8  # step after a start at which those are first measured
-FINE_INTERVAL = 8  # the same for those of fine meshes: it takes some twenty products to find a mode of large kappa
-FINE = 0.15  # segments shorter than this make a fine mesh [um]: one flagellum has kappa 1.5, 2.0, 2.7 at 0.2, 0.1, 0.05
+KAPPA_ALONE = 2.8  # of one flagellum with segments of 0.05 um, in mode consistent; twenty products would find it
+KAPPA_POWER = 0.45  # it falls as h to the power of minus this: 2.0, 1.5 at h = 0.1, 0.2 um
 
 
 @functools.cache
@@ -62,7 +62,7 @@ def struct(p: Precision) -> Any:
     class Stability:
         kappa: wp.array(dtype=wp.float64)
         measured: wp.array(dtype=wp.int32)  # 1: the cell is measured in this pass
-        interval: wp.array(dtype=wp.int32)  # steps between two measurements of one or two flexible flagella
+        least: wp.array(dtype=wp.float64)  # least over-implicitness of one or two flexible flagella
         active: wp.array(dtype=wp.int32)  # copy of `State.active`, which is masked during a measurement
         due: wp.array(dtype=wp.int32)  # [1], 1: some cell is measured in this pass
         probe: Increment  # of the power iteration, unit length, as `kept_increment` keeps it
@@ -93,8 +93,9 @@ def allocate(model: DeviceModel) -> Any:
     # Conditional kernels load in the first pass, which takes no step.
     s.due, s.any_strong = (wp.ones(1, dtype=wp.int32, device=device) for _ in range(2))
     first = model.data.first_flagellum.numpy()
-    fine = np.minimum.reduceat(model.data.rod.segment_length.numpy(), first[:-1]) < FINE
-    s.interval = wp.array(np.where(fine, FINE_INTERVAL, LONG_INTERVAL), dtype=wp.int32, device=device)
+    h = np.minimum.reduceat(model.data.rod.segment_length.numpy().astype(float), first[:-1])
+    alone = OVER_IMPLICIT_PER_KAPPA * KAPPA_ALONE * (0.05 / h) ** KAPPA_POWER
+    s.least = wp.array(np.clip(alone, LEAST_OVER_IMPLICIT, MOST_OVER_IMPLICIT), dtype=wp.float64, device=device)
     nodes = np.diff(model.data.first_node.numpy()[first])
     bending, stretching = _relaxation_rates(model)
     s.bending_rate = wp.array(bending, dtype=wp.float64, device=device)
@@ -127,7 +128,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
     Model, State, Stability, Increment = structs(p).Model, structs(p).State, struct(p), chain_chart.types(p).Increment
     module = p.module("stability", "body_flow" if body_flow else "")
     first_measurements, interval = wp.constant(FIRST_MEASUREMENTS), wp.constant(INTERVAL)
-    first_of_flexible = wp.constant(FIRST_OF_FLEXIBLE)
+    long_interval, first_of_flexible = wp.constant(LONG_INTERVAL), wp.constant(FIRST_OF_FLEXIBLE)
     large_kappa, large_kappa_of_flexible = (wp.constant(wp.float64(x)) for x in (LARGE_KAPPA, LARGE_KAPPA_OF_FLEXIBLE))
     large_kappa_of_stiff = wp.constant(wp.float64(0.0 if body_flow else LARGE_KAPPA))
     tight, relaxed = wp.constant(wp.float64(TIGHT)), wp.constant(wp.float64(RELAXED))
@@ -162,7 +163,7 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
         measured = int(0)
         due = accepted[c] == 0
         if weakly_coupled(model, stability, c, longest_step[c]) and stability.kappa[c] <= large_kappa:
-            due = due or steps[c] % stability.interval[c] == first_of_flexible % stability.interval[c]
+            due = due or steps[c] % long_interval == first_of_flexible
         else:
             due = due or steps[c] < first_measurements or steps[c] % interval == 0
         if state.active[c] != 0 and due:
@@ -325,9 +326,9 @@ def _kernels(p: Precision, body_flow: bool) -> SimpleNamespace:
             stability.strong[c] = wp.where(kappa > most_kappa, 1, 0)
             if stability.strong[c] != 0:
                 stability.any_strong[0] = 1
-            w = least
+            w = wp.where(weak, stability.least[c], least)
             if flexible:
-                w = wp.max(least, fall * over_implicit[c])
+                w = wp.max(w, fall * over_implicit[c])
                 if stability.strong[c] == 0:
                     w = wp.clamp(share * kappa, w, most)
             over_implicit[c] = w
@@ -353,8 +354,7 @@ def schedule(
 
     Args:
         model, state: of the batch.
-        steps: steps attempted by every cell so far, shape [cell_count].
-        accepted: 1: the last one was accepted, shape [cell_count].
+        steps, accepted: attempted by every cell so far; 1: the last one was accepted; shape [cell_count].
         longest_step: [s], shape [cell_count]: a cell that is stiff in such steps is measured often.
         stability: struct `Stability`.
     """

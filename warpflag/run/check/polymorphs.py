@@ -1,7 +1,8 @@
-"""Whether motors of the scene reach the threshold at which filaments change form: told where polymorphs are on."""
+"""Whether filaments of the scene can change their form at all: told where polymorphs are on and none can."""
 
 from __future__ import annotations
 
+from warpflag.model.switching import switch_times
 from warpflag.run.check.rigid import Turning
 from warpflag.scene import FlagellumSpec, Scene
 
@@ -9,35 +10,40 @@ __all__ = ["of_polymorphs"]
 
 
 def of_polymorphs(scene: Scene, stiff: Turning) -> list[str]:
-    """A line where no motor's torque reaches `polymorphs.nucleation`, or only that of a motor that is held.
+    """A line where no filament can change its form: no motor winds one up, or none beyond `polymorphs.nucleation`.
 
     A motor winds its filament up against the handedness in one sense alone: in reverse, for a left-handed filament that
     a positive torque drives. The filament's moment about its axis is at most the torque at its root, but bending adds
     to the moment that nucleation looks at: with a threshold of 1.1 pN um free cells have been seen to flip under 0.8,
-    not under 0.6. Motors of law "rate" take whatever torque their rate asks for, of which nothing is told.
+    not under 0.6. Motors of law "rate" take whatever torque their rate asks for: of them only the sense is told.
 
     Args:
         scene: to look at.
         stiff: its longest flagellum, if it were stiff.
     """
-    if not scene.polymorphs.enabled or not scene.body.enabled:
+    if not scene.polymorphs.enabled:
         return []
-    flagella = scene.resolved_flagella()
-    if any(spec.law == "rate" for spec in flagella):
-        return []
-    threshold = scene.polymorphs.nucleation
-    reverses = [spec for spec in flagella if _winds_up(scene, spec)]
-    if not reverses:
+    if not scene.body.enabled:
+        return ["polymorphs: without a body no motor winds filaments up, which changes their form"]
+    forms, flagella = scene.polymorphs, scene.resolved_flagella()
+    if getattr(forms, forms.target) == scene.flagella.ground_strain:
+        return [f"polymorphs: the target, polymorphs.{forms.target}, is the ground state of the filaments"]
+    winding = [spec for k, spec in enumerate(flagella) if _winds_up(scene, k, spec)]
+    if not winding:
         return [
-            "polymorphs: no motor turns against the handedness of its filament (motor.switching, negative "
-            "motor.torque), which changes its form"
+            "polymorphs: no motor turns against the handedness of its filament within the run (motor.switching, "
+            "negative motor.torque or motor.rate), which changes its form"
         ]
-    bent = f"polymorphs.nucleation {threshold:g}; only bending near root and tip, as of free cells, may exceed that"
-    held = max(_torque_held(scene, spec) for spec in reverses)
-    if held < threshold:
+    if any(spec.law == "rate" for spec in winding):
+        return []
+    bent = (
+        f"polymorphs.nucleation {forms.nucleation:g}; only bending near root and tip, as of free cells, may exceed that"
+    )
+    held = max(_torque_held(scene, spec) for spec in winding)
+    if held < forms.nucleation:
         return [f"polymorphs: no motor winds its filament up beyond {held:.3g} pN um, below {bent}"]
-    steady = max(_torque_turning(scene, spec, stiff) for spec in reverses)
-    if steady < threshold:
+    steady = max(_torque_turning(scene, spec, stiff) for spec in winding)
+    if steady < forms.nucleation:
         return [
             f"polymorphs: motors wind filaments up with about {steady:.2g} pN um in steady rotation, {held:.3g} only "
             f"while they switch, below {bent}"
@@ -45,19 +51,18 @@ def of_polymorphs(scene: Scene, stiff: Turning) -> list[str]:
     return []
 
 
-def _winds_up(scene: Scene, spec: FlagellumSpec) -> bool:
-    """Whether the motor ever turns against the handedness of the filament at rest."""
-    if spec.torque == 0.0:
+def _winds_up(scene: Scene, motor: int, spec: FlagellumSpec) -> bool:
+    """Whether the motor ever turns against the handedness of the filament at rest, within the scene's duration."""
+    if spec.forward == 0.0:
         return False
     if not _in_reverse(scene, spec):
         return True
-    switches = scene.motor.switching == "markov" and scene.motor.to_reverse > 0.0
-    return switches or (scene.motor.switching == "schedule" and bool(spec.switch_times))
+    return any(time < scene.duration for time in switch_times(scene, motor))
 
 
 def _in_reverse(scene: Scene, spec: FlagellumSpec) -> bool:
     """Whether the sense that winds up is the motor's second."""
-    return spec.torque * scene.flagella.ground_strain[2] <= 0.0
+    return spec.forward * scene.flagella.ground_strain[2] <= 0.0
 
 
 def _torque_held(scene: Scene, spec: FlagellumSpec) -> float:
