@@ -37,7 +37,7 @@ LEAST_OVER_IMPLICIT = 1.3  # least over-implicitness, enough for kappa up to 2.6
 OVER_IMPLICIT_PER_KAPPA = 0.6  # stability needs 0.5; the rest covers the growth of kappa between two measurements
 # Least ratio of an over-implicitness to the one before: a power iteration approaches the eigenvalue from below.
 LARGEST_FALL = 0.985
-MOST_OVER_IMPLICIT = 5.0  # largest over-implicitness: beyond, (1 - 1/w)^2 leaves more than 0.64 of a stiff mode
+MOST_OVER_IMPLICIT = 9.0  # largest over-implicitness, enough for LARGE_KAPPA_OF_FLEXIBLE
 FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST_OVER_IMPLICIT, the limit of stability: from there on the full mobility is solved with
 LARGE_KAPPA_OF_FLEXIBLE = 15.0  # the same for flexible cells: growths up to 13 amid contacts are of sound steps
