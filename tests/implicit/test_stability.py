@@ -169,7 +169,7 @@ def test_a_step_begins_with_no_more_than_keeps_slow_modes_damped(device, precisi
 
 
 def test_kappa_is_measured_while_a_flagellum_turns(device):
-    """Not half of what it is at a standstill; and steps are stable, so that its energy is steady, on a fine mesh too."""
+    """Not half of what it is at rest; and steps are stable, so that its energy is steady on a fine mesh, too."""
     values = {"flagella.count": 1, "flagella.segment_length": 0.05, "flagella.length": 6.0, "body.anchored": True}
     values |= {"flagella.opening_angle": 0.0, "flagella.on_axis": True, "flagella.anchor_offset": 1.2}
     sim = Simulation(
