@@ -10,7 +10,7 @@ import pytest
 
 from tests.runs import small, summary
 from warpflag.run import execute, run
-from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, Growth, chosen, growth, growth_words
+from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, PATIENCE, Growth, chosen, growth, growth_words
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended
 from warpflag.scene import paper_scene, with_values
@@ -176,3 +176,40 @@ def test_a_crowd_is_followed_sooner_but_from_one_frame(count, share, expected, t
     achieved.worst_end.fill_(1.3e-4)
     started.execute(quiet=True)
     assert asked == [FOLLOWED_IN_CROWDS if expected == 1 else FOLLOWED] * expected
+
+
+@pytest.mark.parametrize(("precision", "size"), [("float64", 1e-6), ("float32", 1e-4)])
+def test_the_disturbance_is_far_above_round_off(precision, size, monkeypatch):
+    """Root mean square over the free nodes; nodes at anchors stay."""
+    given = []
+
+    class Looked:
+        def __init__(self, scenes, device, starts, **_options):
+            given.extend(starts)
+
+        def advance(self, until, watch):
+            raise Ended("late", "")
+
+    monkeypatch.setattr("warpflag.run.growth.Simulation", Looked)
+    growth(small({"numerics.precision": precision}), [still(0.0)], np.array([0, 11, 22]), "cpu", 2e-7)
+    apart = np.array(given[1].positions) - np.array(given[0].positions)
+    assert (apart[:, 0] == 0.0).all()
+    assert np.sqrt((apart[:, 1:] ** 2).sum(axis=2).mean()) == pytest.approx(size, rel=0.3)
+
+
+def test_members_of_a_batch_share_the_time_for_following(tmp_path, monkeypatch):
+    clock, given = [0.0], []
+
+    def found(scene, states, first_node, device, step, patience, followed, check):
+        given.append(patience)
+        clock[0] += 15.0
+
+    monkeypatch.setattr(execute, "growth", found)
+    monkeypatch.setattr(execute, "process_time", lambda: clock[0])
+    scenes = [small({"numerics.on_accuracy": "warn", "duration": 4e-5, "frames": 4})] * 3
+    started = run.start_batch(scenes, [tmp_path / name for name in "abc"], "cpu", movies=False)
+    achieved = started.simulation.stepper.steps.achieved
+    achieved.window_time.fill_(-1.0)
+    achieved.worst.fill_(1e3)
+    started.execute_all(quiet=True)
+    assert given == [PATIENCE, PATIENCE - 15.0]

@@ -7,6 +7,7 @@ import pytest
 
 from tests.helpers import cell, displaced
 from tests.oracles import body_gaps, contact_distances
+from warpflag.model.clear_start import pairs_within
 from warpflag.model.geometry import initial_state
 from warpflag.model.start import starting_state
 from warpflag.run.simulation import Simulation
@@ -102,3 +103,13 @@ def test_a_given_start_inside_the_body_is_refused():
     with pytest.raises(SceneError, match=r"flagellum 0 inside the body: node 1 is 0\.\d+ um deep"):
         Simulation(scene, device="cpu", starts=displaced(scene, start, inward))
     Simulation(with_values(scene, {"body.contact": False}), device="cpu", starts=displaced(scene, start, inward))
+
+
+@pytest.mark.parametrize(("count", "others"), [(10, 20), (64, 128), (150, 333), (65, 30)])
+def test_pairs_of_near_points_are_those_of_all_pairs(count, others):
+    """Of points along two random walks, shorter and longer than what is looked at together."""
+    random = np.random.default_rng(count)
+    a, b = (np.cumsum(0.1 * random.standard_normal((n, 3)), axis=0) for n in (count, others))
+    expected = np.nonzero(np.linalg.norm(a[:, None] - b, axis=2) < 0.5)
+    assert len(expected[0]) > 5
+    np.testing.assert_array_equal(pairs_within(a, b, 0.5), expected)

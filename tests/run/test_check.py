@@ -63,6 +63,10 @@ def test_sizes_of_what_is_left_out_are_those_of_theory():
     far = turning(small()).axial_length + 0.4
     mean = np.mean(1.5 * 0.4 / np.linspace(0.4, far, 10001))
     assert told(r"about (\d+) % of the swimming speed", **sphere) == pytest.approx(100 * mean, abs=1.0)
+    # Never more than all of it.
+    assert (
+        told(r"about (\d+) % of the swimming speed", body__length=50.0, body__width=20.0, flagella__length=1.0) == 100
+    )
     # Near the rear pole of a long body, whose drag is that of a sphere of another radius.
     a = 1 / (6 * math.pi * 1e-3 * spheroid_mobility(2.5, 0.8, 1e-3).along)
     mean = np.mean(1.5 * a / np.linspace(1.2, 1.2 + turning(small()).axial_length, 10001))
@@ -270,6 +274,27 @@ def test_a_sample_ends_when_its_time_is_over(monkeypatch):
     monkeypatch.setattr(simulation, "advance", slow)
     spent, rest = time_needed.stepping_time(simulation, 2.5)
     assert spent == 3.0 and rest == pytest.approx(3.0 / 1e-9 * 8e-5)
+
+
+def test_the_time_of_all_samples_is_limited(monkeypatch):
+    simulation = Simulation(small(), device="cpu")
+    clock = [0.0]
+
+    def slower(until, watch):
+        """The first to its end in 2 s; the next does not come to one."""
+        clock[0] += 2.0
+        if clock[0] == 2.0:
+            simulation.system.control.time.fill_(until)
+            return
+        while True:
+            watch()
+            clock[0] += 1.0
+
+    monkeypatch.setattr("warpflag.run.check.time_needed.time", SimpleNamespace(process_time=lambda: clock[0]))
+    monkeypatch.setattr(simulation, "advance", slower)
+    simulation.scenes[0] = small({"duration": 0.5, "frames": 10})
+    spent, _ = time_needed.stepping_time(simulation, 5.5)
+    assert spent == 6.0
 
 
 def test_long_flagella_are_taken_with_fewer_segments(monkeypatch):

@@ -203,6 +203,7 @@ def test_a_checkpoint_holds_nothing_outside_the_table(each_half):
         ("control.time", np.nan),
         ("control.time", 1e-9),
         ("control.steps", 0),
+        ("control.steps", 1),
         ("frame.index", -1),
         ("frame.index", FRAME - 3),
         ("frame.index", 999),
@@ -223,6 +224,17 @@ def test_a_forged_value_is_refused_and_the_record_stays(half, name, value, tmp_p
 
     # A time that is too early shows in the frames, which are then ahead of it.
     refused(forged(half, tmp_path, change, meta_change), "frame." if name == "control.time" and value > 0 else name)
+
+
+@pytest.mark.parametrize("name", ["frame.index", "frame.time"])
+def test_frames_ahead_of_the_clock_are_refused(half, name):
+    """Of a checkpoint in memory, too, which has no record beside it."""
+    held, _ = checkpoint.load(half)
+    simulation = Simulation(small(), device="cpu")
+    ahead = {**held, name: held[name] + (1 if name == "frame.index" else 1e-5)}
+    with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+        simulation.restore(ahead)
+    simulation.restore(held)
 
 
 def test_a_frame_of_another_time_is_refused(half, tmp_path):

@@ -91,7 +91,8 @@ def test_two_iterators_share_the_frames_of_a_batch(device, monkeypatch):
 def test_a_restored_simulation_forgets_frames_of_before(device):
     scene = small()
     simulation = Simulation(scene, device=device)
-    next(simulation.frames(scene.duration))
+    frames = simulation.frames(scene.duration)
+    assert [next(frames).time for _ in range(2)] == [0.0, 1e-5]  # the first stands alone, the second is of a block
     with frame_by_frame():
         other = Simulation(scene, device=device)
         frames = other.frames(scene.duration)

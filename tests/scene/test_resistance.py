@@ -14,8 +14,8 @@ import pytest
 from tests.helpers import attachment, cell, ground_state_frames, helix_axis, placed
 from tests.oracles import device_mobility
 from warpflag.run.simulation import Simulation
-from warpflag.scene import SceneError, paper_scene, with_values
-from warpflag.scene.resistance import pace, pair_radii, spheroid_mobility
+from warpflag.scene import Scene, SceneError, paper_scene, with_values
+from warpflag.scene.resistance import pace, pair_radii, pair_radius, spheroid_mobility
 
 # Relative to resistive-force theory and to the numbers quoted below, which have three or four digits.
 TOLERANCE = {"float64": 5e-3, "float32": 5e-3}
@@ -176,3 +176,13 @@ def test_a_pair_radius_that_is_refused_names_one_that_is_taken(mode):
         assert pair_radii(enough) == [named] * 2
         with pytest.raises(SceneError, match=f"{named:g} um is the least"):
             pair_radii(less)
+
+
+def test_segments_of_each_length_have_the_pair_radius_of_their_own():
+    """In mode consistent; as in a scene of segments of that length alone."""
+    mode = {"hydrodynamics.mode": "consistent"}
+    both = with_values(Scene(name="unequal"), {**mode, "flagellum.0.segments": 30, "flagellum.1.segments": 60})
+    lengths = [spec.segment_length for spec in both.resolved_flagella()]
+    alone = [pair_radius(with_values(Scene(name="equal"), {**mode, "flagella.segment_length": h})) for h in lengths]
+    assert [pair_radius(both, h) for h in lengths] == pytest.approx(alone, rel=1e-9)
+    assert alone[0] != pytest.approx(alone[1], rel=0.1) and pair_radius(both) == pytest.approx(max(alone))

@@ -20,7 +20,7 @@ from warpflag.observables import closest_parameters
 from warpflag.scene import Body, FlagellumSpec, Scene, SceneError
 from warpflag.scene.resistance import steric_diameter
 
-__all__ = ["body_gaps", "clear_start"]
+__all__ = ["body_gaps", "clear_start", "pairs_within"]
 
 Array = NDArray[np.floating]
 
@@ -199,7 +199,7 @@ class _Cell:
         e = np.concatenate([np.diff(x, axis=0) for x in others])
         longest = np.linalg.norm(d, axis=1).max() + np.linalg.norm(e, axis=1).max()
         span = reach + longest / 2
-        i, j = _pairs_within(p + d / 2, q + e / 2, span)
+        i, j = pairs_within(p + d / 2, q + e / 2, span)
         s, t = closest_parameters(p[i], d[i], q[j], e[j])
         points = p[i] + s[:, None] * d[i]
         away = points - q[j] - t[:, None] * e[j]
@@ -226,7 +226,7 @@ class _Cell:
         return SceneError(f"flagellum.{k}.tilt", spec.tilt, problem, related)
 
 
-def _pairs_within(a: Array, b: Array, span: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def pairs_within(a: Array, b: Array, span: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Indices i, j of points a_i and b_j less than a span apart, in ascending order.
 
     Neighbours along a flagellum lie beside each other, so runs of them are in small boxes: only those of boxes within
