@@ -23,8 +23,8 @@ from tests.contacts import (
     steric_force,
     touching,
 )
-from tests.helpers import cell
-from tests.oracles import body_gaps, segment_distances
+from tests.helpers import cell, touching_cell
+from tests.oracles import CUTOFF, body_gaps, segment_distances
 from tests.plans import by_elements
 from warpflag.run.simulation import Simulation
 
@@ -49,15 +49,17 @@ PLANNED = pytest.mark.parametrize("planned", [lambda own: own, by_elements], ids
 
 
 @PLANNED
-@pytest.mark.parametrize("values", [{}, CROWD], ids=["two", "three"])
-def test_search_finds_every_contact_and_nothing_else(values, planned, device, precision):
-    total = 0
+@pytest.mark.parametrize("values, asked", [({}, 0.0), (CROWD, 0.0), ({}, 2.1 * SIGMA)], ids=["two", "three", "farther"])
+def test_search_finds_every_contact_and_nothing_else(values, asked, planned, device, precision):
+    """Up to the least reach, or to what the step asks for."""
+    total, reach = 0, max(REACH, asked)
     for seed in range(4):
         b = touching(values, precision, device, seed, planned=planned)
+        b.stepper.contacts.reach.fill_(asked)
         find(b)
-        found, exact = listed_contacts(b), expected_contacts(b, REACH + 1e-6)
+        found, exact = listed_contacts(b), expected_contacts(b, reach + 1e-6)
         assert found.keys() <= exact.keys()
-        assert all(gap > REACH - 1e-6 for pair, gap in exact.items() if pair not in found)
+        assert all(gap > reach - 1e-6 for pair, gap in exact.items() if pair not in found)
         x = b.data.pose.position.numpy().astype(np.float64)
         for (e, other), row in found.items():
             assert abs(row["gap"] - exact[e, other]) < 1e-6
@@ -72,6 +74,20 @@ def test_search_finds_every_contact_and_nothing_else(values, planned, device, pr
                 assert np.diff(body_gaps(b.scene, b.start, away))[0] == pytest.approx(0.01, abs=1e-6)
         total += len(found)
     assert total > 40
+
+
+def test_contacts_are_searched_for_farther_where_a_step_may_err_by_more(device, precision):
+    """The cutoff and three times what the step may err, tau (dt/ms)^(1/2), and no more than sigma beyond the cutoff."""
+    for accuracy, beyond in ((5e-3, 3 * 5e-3 * 0.2**0.5), (0.5, SIGMA)):
+        sim = Simulation(
+            touching_cell({"numerics.stepper": "implicit", "numerics.accuracy": accuracy}, precision), device=device
+        )
+        sim.stepper.steps.wanted_step.fill_(2e-4)
+        sim.system.control.longest_step.fill_(2e-4)
+        sim.system.control.target.fill_(1.0)
+        sim.system.state.data.active.fill_(1)
+        sim.stepper.launch_pass()
+        assert sim.stepper.contacts.reach.numpy()[0] == pytest.approx(CUTOFF * SIGMA + beyond, rel=1e-6)
 
 
 def chain_of(head: int, following: np.ndarray) -> list[int]:

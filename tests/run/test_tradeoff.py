@@ -17,7 +17,7 @@ from warpflag.run.tradeoff import Study, choices, compared, points, windows
 from warpflag.scene import with_values
 
 SCENE = {"duration": 8e-4, "frames": 8, "flagella.length": 3.0}
-MEASURED = ("accuracy 0.05", "accuracy 0.0005", "pairs float32", "h 0.3", "h 0.1")
+MEASURED = ("accuracy 0.07", "accuracy 0.0005", "pairs float32", "h 0.3", "h 0.1")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_the_table_has_every_point_beside_its_reference(studied):
     assert all(row["status"] == "done" and float(row["cost_ms_per_ms"]) > 0 for row in rows)
     for window in names:
         error = {row["choice"]: float(row["node_error_um"]) for row in rows if row["window"] == window}
-        assert 0 < 5 * error["accuracy 0.0005"] < error["accuracy 0.05"] < 0.1
+        assert 0 < 5 * error["accuracy 0.0005"] < error["accuracy 0.07"] < 0.1
         assert np.isnan(error["h 0.1"]) and np.isnan(error["reference"])
         off = {row["choice"]: float(row["speed_off"]) for row in rows if row["window"] == window}
         assert off["h 0.1"] == 0.0 != off["reference"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from warpflag.scene.settings import Section, choice, integer, number, text
 
-ACCURACY_LEVELS = {"draft": 5e-2, "standard": 5e-3, "careful": 5e-4}
+ACCURACY_LEVELS = {"draft": 7e-2, "standard": 5e-3, "careful": 5e-4}
 """Node error per simulated ms that the words for `numerics.accuracy` ask for [um]."""
 SHORT_PAIRS_IN, SHORT_PAIRS_FROM = ("draft", "standard"), 1000
 """Levels, and number of segments from which on, at which flows of pairs are taken in float32 unless the scene says
@@ -39,7 +39,7 @@ class Numerics(Section, key="numerics"):
         "um",
         1e-9,
         1,
-        "wanted node error per simulated ms; draft: 5e-2, standard: 5e-3, careful: 5e-4",
+        "wanted node error per simulated ms; draft: 7e-2, standard: 5e-3, careful: 5e-4",
         choices=tuple(ACCURACY_LEVELS),
         derived="5e-3, but euler takes fixed steps",
     )

@@ -35,7 +35,7 @@ from warpflag.stepping.stepper import System, allocated_control, recalled, resta
 
 __all__ = ["History", "ImplicitStepper", "Scratch"]
 
-LONGEST_STEP = 5.0e-5
+LONGEST_STEP = 7.0e-5
 """Longest step that the accuracy control takes [s]."""
 FIRST_TOLERANCE = 2.0
 """Tolerance of the gaps in the first iteration over that in the second."""

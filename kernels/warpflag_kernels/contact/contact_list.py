@@ -31,6 +31,7 @@ def struct(p: Precision) -> Any:
         first: wp.array(dtype=wp.int32)  # [C + 1]
         count: wp.array(dtype=wp.int32)  # [C]
         position: wp.array(dtype=vec3)  # [E], of the nodes at the last search [um]
+        reach: wp.array(dtype=real)  # [C], gap up to which pairs are listed, if above the least [um]
         overflow: wp.array(dtype=wp.int32)  # [C], 1: the list is too short for the contacts found
         found: wp.array(dtype=wp.uint64)  # [E], which neighbours of a segment are contacts, a bit each
         start: wp.array(dtype=wp.int32)  # [E], contacts found by this segment or node lie in [start, stop)
@@ -250,6 +251,7 @@ def allocate(model: DeviceModel, touching: bool) -> Any:
     c.first = wp.array(first, dtype=wp.int32, device=device)
     c.count, c.overflow = zeros(cells, wp.int32), zeros(cells, wp.int32)
     c.start, c.stop, c.head = (zeros(elements, wp.int32) for _ in range(3))
+    c.reach = zeros(cells, p.real)
     c.found = zeros(elements, wp.uint64)
     c.position = zeros(elements, p.vec3)
     c.body_head = zeros(model.flagellum_count, wp.int32)

@@ -2,7 +2,7 @@
 
 Pairs within the cutoff plus a margin, flagellum against flagellum and node against body, go into one list per cell:
 counted per segment, summed up, filled in, and linked for the segments of the other side; no atomics, the same order
-every time.
+every time. The margin grows with what the step may err.
 """
 
 import functools
@@ -16,8 +16,11 @@ from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours, steric
 from warpflag_kernels.contact.constants import CUTOFF
 
-MARGIN = 0.3  # added to the cutoff for the error of the predicted pose [sigma]
-REACH = CUTOFF + MARGIN  # largest gap of a listed pair [sigma]
+# Pairs are listed up to the cutoff plus a margin for the error of the predicted pose: three times what the step may
+# err, at least MARGIN, at most MOST_MARGIN.
+MARGIN, MOST_MARGIN = 0.3, 1.0  # [sigma]
+MARGIN_PER_ERROR = 3.0
+REACH = CUTOFF + MARGIN  # least gap up to which every pair is listed [sigma]
 
 
 @functools.cache
@@ -74,7 +77,7 @@ def _kernels(p: Precision, segments: bool, body: bool, with_self: bool) -> Simpl
         """
         k = model.flagellum_of[e]
         c = model.cell_of[e]
-        reach = reach_factor * model.steric.diameter[c]
+        reach = wp.max(reach_factor * model.steric.diameter[c], listed.reach[c])
         found = int(0)
         seen = wp.uint64(0)
         q1 = pose.position[e]

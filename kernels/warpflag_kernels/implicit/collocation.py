@@ -32,7 +32,8 @@ from warpflag_kernels.base import clock
 from warpflag_kernels.base.clock import NO_FAULT, Control
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, structs
-from warpflag_kernels.contact import contact_list
+from warpflag_kernels.contact import contact_list, search
+from warpflag_kernels.contact.constants import CUTOFF
 from warpflag_kernels.implicit import block_band, contact_solve, delassus
 from warpflag_kernels.rod import chain_chart
 from warpflag_kernels.rod import comoving_chart as chart_stage
@@ -125,6 +126,8 @@ def kernels(p: Precision) -> SimpleNamespace:
     unsolved, crowded, inaccurate, unbalanced = (
         wp.constant(wp.int32(encode(kind))) for kind in (Fault.UNSOLVED, Fault.CROWDED, Fault.ACCURACY, Fault.BALANCE)
     )
+    cutoff, per_error = wp.constant(wp.float64(CUTOFF)), wp.constant(wp.float64(search.MARGIN_PER_ERROR))
+    most_margin = wp.constant(wp.float64(search.MOST_MARGIN))
     finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
 
     @wp.kernel(module=module)
@@ -174,9 +177,11 @@ def kernels(p: Precision) -> SimpleNamespace:
         band.singular[c] = 0
         law.gain[c] = g
         law.failed[c] = 0
-        finest_gap = wp.float64(model.steric.diameter[c]) * finest
-        enough = wp.max(gap_share * allowed(steps, c, dt), gap_growth * dt * dt * dt)
-        law.gap_tolerance[c] = real(wp.max(finest_gap, enough))
+        diameter = wp.float64(model.steric.diameter[c])
+        may_err = allowed(steps, c, dt)
+        enough = wp.max(gap_share * may_err, gap_growth * dt * dt * dt)
+        law.gap_tolerance[c] = real(wp.max(finest * diameter, enough))
+        contacts_out.reach[c] = real(cutoff * diameter + wp.min(per_error * may_err, most_margin * diameter))
         contacts_out.overflow[c] = 0
         imp.evaluations[c] += 1
 

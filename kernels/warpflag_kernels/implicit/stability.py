@@ -42,10 +42,10 @@ FIRST_MEASUREMENTS = 30  # steps after a start that are all measured
 LARGE_KAPPA = 2.6  # twice LEAST_OVER_IMPLICIT, the limit of stability: from there on the full mobility is solved with
 LARGE_KAPPA_OF_FLEXIBLE = 15.0  # the same for flexible cells: growths up to 13 amid contacts are of sound steps
 FREE_ROD = 4.730041  # first root of cosh q cos q = 1: a free rod's slowest bending decays at A q^4/(gamma_perp L^4)
-RELAXED = 0.1  # decay times of that mode in a step from which a cell counts as stiff
+RELAXED = 0.14  # decay times of that mode in a step from which a cell counts as stiff
 # Decay times of the longest stretching mode, at K pi^2/(gamma_par L^2), in the longest step, from which a cell counts
-# as stiff: two flagella of the default stiffness go through five.
-TIGHT = 10.0
+# as stiff: two flagella of the default stiffness go through seven.
+TIGHT = 14.0
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
 LONG_INTERVAL = 32  # the same for one or two flexible flagella of small kappa
 FIRST_OF_FLEXIBLE = 8  # step after a start at which those are first measured

@@ -6,14 +6,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from warpflag.scene import Scene, SceneError, with_values
+from warpflag.scene.run_sections import ACCURACY_LEVELS
 from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
 __all__ = ["SOURCES", "Choice", "choices_of", "reference", "relative_cost"]
 
 SOURCES = ("time step", "precision", "mesh", "model", "execution")
 """What an error comes from, in the order of the report."""
-_ACCURACIES = (5e-2, 2e-2, 1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 1e-4)  # um per ms, of the implicit stepper
-_RKC_ACCURACIES = (5e-2, 5e-3)  # as draft and standard; finer ones take minutes
+_DRAFT, _CAREFUL = ACCURACY_LEVELS["draft"], ACCURACY_LEVELS["careful"]
+_ACCURACIES = (_DRAFT, 2e-2, 1e-2, DEFAULT_ACCURACY, 2e-3, 1e-3, _CAREFUL, 1e-4)  # um per ms, of the implicit stepper
+_RKC_ACCURACIES = (_DRAFT, DEFAULT_ACCURACY)  # finer ones take minutes
 _FIXED_STEPS = (2e-5, 1e-5)  # fixed steps [s]: near those that step control takes
 _RELATIVE_COST = {"rkc": 10.0}  # of a stepper, roughly: zipping.toml takes nine times as long
 _COST_POWER = 0.4  # cost goes as accuracy to the minus this: errors of steps as dt^2.5
@@ -78,14 +80,22 @@ def choices_of(scene: Scene, devices: list[str]) -> list[Choice]:
     standard = {**_EXACT, "numerics.accuracy": DEFAULT_ACCURACY}
     found = [
         Choice(
-            f"accuracy {a:g}", "time step", {**_EXACT, "numerics.accuracy": a}, turn=0 if a in (5e-3, 5e-2, 5e-4) else 1
+            f"accuracy {a:g}",
+            "time step",
+            {**_EXACT, "numerics.accuracy": a},
+            turn=0 if a in ACCURACY_LEVELS.values() else 1,
         )
         for a in _ACCURACIES
     ]
     single = {"numerics.pair_precision": "float32"}
     found += [
         Choice("pairs float32", "precision", {**standard, **single}, turn=1),
-        Choice("accuracy 0.05, pairs float32", "precision", {**standard, **single, "numerics.accuracy": 5e-2}, turn=2),
+        Choice(
+            f"accuracy {_DRAFT:g}, pairs float32",
+            "precision",
+            {**standard, **single, "numerics.accuracy": _DRAFT},
+            turn=2,
+        ),
         Choice("float32", "precision", {**standard, "numerics.precision": "float32"}, turn=3),
     ]
     h = scene.flagella.segment_length
