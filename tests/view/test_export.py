@@ -85,7 +85,7 @@ def test_vtk_reads_what_was_written(record, tmp_path):
 
 
 def test_mdanalysis_reads_the_record(record):
-    """With the call that the README gives."""
+    """With the call that docs/records.md gives."""
     analysis = pytest.importorskip("MDAnalysis")
     universe = analysis.Universe.empty(FIRST_NODE[-1])
     universe.load_new(str(record.path), format="H5MD", convert_units=False)
