@@ -304,3 +304,9 @@ def test_long_flagella_are_taken_with_fewer_segments(monkeypatch):
     coarse = turning(scene)
     assert coarse.rate == pytest.approx(fine.rate, rel=0.03) and coarse.rate != fine.rate
     assert any("mesh: not looked at with 120 segments" in line for line in left_out(scene, coarse))
+
+
+def test_the_mesh_error_is_told_in_per_cent():
+    assert told(r"are about ([+-][\d.]+) % off", flagella__length=3.0) == pytest.approx(
+        100 * mesh_dependence(small({"flagella.length": 3.0}), 0.5), abs=0.06
+    )

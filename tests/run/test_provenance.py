@@ -111,6 +111,14 @@ def test_the_checkpoint_of_another_run_is_refused(tmp_path):
         run.resume(str(directory))
 
 
+def test_runs_of_which_some_have_no_checkpoint_are_resumed_by_themselves(tmp_path):
+    made, other = halved(tmp_path / "made"), halved(tmp_path / "other")
+    for path in other.glob("checkpoint-*"):
+        path.unlink()
+    with pytest.raises(RunError, match="some runs of the batch have a checkpoint and some have none"):
+        run.resume_batch([made, other])
+
+
 def test_a_setting_that_a_later_version_adds_leaves_runs_resumable():
     """Checkpoints are known by the hash of the settings, in which what is as by default does not count."""
     scene, default = small({"motor.torque": 1.0}), Scene(name="default")

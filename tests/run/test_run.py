@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from warpflag_kernels.stepping.health import Fault
 
 from tests.runs import arrays, executed, frame_by_frame, small, summary
@@ -102,3 +103,9 @@ def test_likely_causes_are_told_the_farthest_from_usual_first():
     line = str(NumericalError(Fault.STRAIN, 2e-3, 0, 1, 4, far))
     assert "flagellum 1, segment 4: a segment is stretched" in line and "stopped at 2 ms" in line
     assert f"; likely cause: {causes[0]}, {causes[1]}; take a lower motor.torque" in line  # two at most
+
+
+@pytest.mark.parametrize(("stepper", "judged"), [("implicit", True), ("rkc", False)])
+def test_the_summary_tells_whether_steps_were_asked_for_their_balance(stepper, judged, tmp_path):
+    scene = small({"numerics.stepper": stepper, "duration": 1e-5, "frames": 1})
+    assert summary(executed(scene, tmp_path / "made"))["balance"] == {"judged": judged, "violations": 0}

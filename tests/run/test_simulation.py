@@ -71,6 +71,23 @@ def test_frames_go_on_where_an_iterator_was_left(device):
         np.testing.assert_array_equal(a.positions, b.positions)
 
 
+def test_a_cell_that_is_not_there_has_no_part():
+    simulation = Simulation([small(), small()], device="cpu")
+    kept = simulation.checkpoint()
+    for name, values in simulation.part(kept, -1).items():
+        np.testing.assert_array_equal(values, simulation.part(kept, 1)[name])
+    with pytest.raises(IndexError):
+        simulation.part(kept, 2)
+
+
+def test_frames_of_a_cell_that_has_advanced_begin_where_it_stands(device):
+    """The first is of the present; those before it are past."""
+    simulation = Simulation(small(), device=device)
+    simulation.advance(2.5e-5)
+    expected = [2.5e-5, *(k * 1e-5 for k in range(3, 9))]
+    np.testing.assert_allclose(times_of(simulation.frames(8e-5)), expected, rtol=1e-12)
+
+
 def test_two_iterators_share_the_frames_of_a_batch(device, monkeypatch):
     monkeypatch.setattr(frame_slots, "MOST_SLOTS", 3)
     scenes = [small(), small({"frames": 5})]

@@ -351,7 +351,7 @@ class Simulation:
         flagella, nodes = self._own(cell)
         sizes = (len(self.scenes), self._first_flagellum[-1], self.first_node[-1])
         # Where two of the sizes are equal, each cell has one flagellum, and the parts are equal too.
-        rows = dict(zip(sizes, (slice(cell, cell + 1), flagella, nodes), strict=True))
+        rows = dict(zip(sizes, (slice(k := range(sizes[0])[cell], k + 1), flagella, nodes), strict=True))
         return {name: values[rows[len(values)]] for name, values in arrays.items()}
 
     @alone
