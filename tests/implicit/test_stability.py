@@ -177,7 +177,7 @@ def test_kappa_is_measured_while_a_flagellum_turns(device):
     )
     measured, energies = [], []
     for i in range(20):
-        sim.advance(0.012 + i * 5e-4)
+        sim.advance(0.02 + i * 5e-4)
         measured.append(float(sim.stepper.stability.kappa.numpy()[0]))
         energies.append(sim.state.elastic_energy.sum())
     system, s, response = sim.system, sim.stepper, chain_chart.allocate(sim.system.model)
