@@ -122,7 +122,7 @@ def test_members_that_are_handed_back_and_dealt_out_anew_end_as_in_one_process(t
 
 def test_a_worker_hands_back_what_is_not_done_with_the_bits_of_single_runs(tmp_path):
     scenes = [
-        small({"duration": d, "frames": 200, "motor.torque": t}) for d, t in ((8e-5, 2.0), (30e-3, 3.0), (28e-3, 1.0))
+        small({"duration": d, "frames": 200, "motor.torque": t}) for d, t in ((8e-5, 2.0), (60e-3, 3.0), (55e-3, 1.0))
     ]
     directories = [tmp_path / f"{k}" for k in range(3)]
     process = subprocess.Popen(
