@@ -132,7 +132,7 @@ CONSTANTS = {
     "stability.LEAST_OVER_IMPLICIT": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.OVER_IMPLICIT_PER_KAPPA": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.LARGEST_FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
-    "stability.MOST_OVER_IMPLICIT": Constant("implicit.stability", (5.0, 2.0, 3.0, 9.0), CROWDED),
+    "stability.MOST_OVER_IMPLICIT": Constant("implicit.stability", (9.0, 2.0, 3.0, 5.0), CROWDED),
     "stability.LARGE_KAPPA_OF_FLEXIBLE": Constant("implicit.stability", (15.0, 2.6, 3.7, 5.0, 8.3), CROWDED),
     "stability.FIRST_MEASUREMENTS": Constant("implicit.stability", (30, 1, 10, 100), ("crowd",)),
     "stability.INTERVAL": Constant("implicit.stability", (4, 1, 2, 8, 32), ("crowd",)),
@@ -175,7 +175,7 @@ CONSTANTS = {
     ),
     "implicit.FIRST_TOLERANCE": Constant("stepping.implicit", (2.0, 0.5, 1.0, 4.0, 16.0), TOUCHING, package=DRIVER),
     "implicit.LONGEST_STEP": Constant(
-        "stepping.implicit", (5e-5, 2e-5, 3e-5, 7e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 0.5),), package=DRIVER
+        "stepping.implicit", (7e-5, 3e-5, 5e-5, 1e-4), (*TWO, "crowd"), (("accuracy", 7e-2),), package=DRIVER
     ),
     "implicit.OVER_IMPLICIT_CROWD": Constant("stepping.implicit", (3.0, 1.3, 2.0, 5.0), ("crowd",), package=DRIVER),
 }
