@@ -49,7 +49,7 @@ TIGHT = 14.0
 INTERVAL = 4  # steps between two measurements later; 8 lost stability for 0.1 ms once, 0.02 um in all nodes
 LONG_INTERVAL = 32  # the same for one or two flexible flagella of small kappa
 FIRST_OF_FLEXIBLE = 8  # step after a start at which those are first measured
-KAPPA_ALONE = 2.8  # of one flagellum with segments of 0.05 um, in mode consistent; twenty products would find it
+KAPPA_ALONE = 2.8  # of one flagellum, h = 0.05 um, in mode consistent; a power iteration takes twenty products to it
 KAPPA_POWER = 0.45  # it falls as h to the power of minus this: 2.0, 1.5 at h = 0.1, 0.2 um
 
 
