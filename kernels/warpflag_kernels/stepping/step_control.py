@@ -29,8 +29,8 @@ from warpflag_kernels.stepping.accuracy import Achieved
 # Of one step over the one before. BDF2 is stable up to 1 + 2^1/2 = 2.41.
 LARGEST_GROWTH = 2.0
 REJECTED = 5.0  # a step is repeated if its estimate exceeds what it may make by this factor; see docs/numerics.md
-# The same for errors of equal sign, those of RKC. In float32 they are round-off that shorter steps don't lower.
-REJECTED_SYSTEMATIC = 25.0
+# The same for errors of equal sign, those of RKC. In float32 they may be round-off that shorter steps don't lower.
+REJECTED_SYSTEMATIC = {"float64": 5.0, "float32": 25.0}
 SAFETY = 0.8  # fraction of the allowed error at which the weighted mean of the estimates is kept
 FADING_STEPS = 20.0  # over how many steps that mean fades
 # Time constant of the mean for errors of equal sign [s]: in float32 it spans the last estimates above round-off.
@@ -96,7 +96,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     module = p.module("step_control", "independent" if independent else "systematic")
     may_make, longest_step = accuracy.functions(independent).may_make, accuracy.functions(independent).longest
     growth, smallest = wp.constant(wp.float64(LARGEST_GROWTH)), wp.constant(wp.float64(SMALLEST_STEP))
-    rejection = wp.constant(wp.float64(REJECTED if independent else REJECTED_SYSTEMATIC))
+    rejection = wp.constant(wp.float64(REJECTED if independent else REJECTED_SYSTEMATIC[p.name]))
     safety = wp.constant(wp.float64(SAFETY))
     memory = wp.constant(wp.float64(FADING_STEPS if independent else FADING_TIME))
     forgotten, per_step = wp.constant(wp.float64(FORGOTTEN)), wp.constant(wp.float64(math.exp(-1.0 / FADING_STEPS)))
