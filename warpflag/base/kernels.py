@@ -31,7 +31,10 @@ def noted_launches() -> Iterator[set[tuple[Any, int | None]]]:
     Returns:
         Kernels that were launched, each with its block size where one was given.
     """
-    wp, noted = start_warp(), set()
+    start_warp()
+    from warpflag_kernels.base.program import replaced
+
+    noted: set[tuple[Any, int | None]] = set()
 
     def launch(kernel: Any, *_arguments: Any, block_dim: int | None = None, **_options: Any) -> None:
         noted.add((kernel, block_dim))
@@ -41,15 +44,8 @@ def noted_launches() -> Iterator[set[tuple[Any, int | None]]]:
             if body is not None:
                 body(**options)
 
-    own = {"launch": launch, "capture_if": under, "capture_while": under}
-    kept = {name: getattr(wp, name) for name in own}
-    try:
-        for name, function in own.items():
-            setattr(wp, name, function)
+    with replaced(launch=launch, capture_if=under, capture_while=under):
         yield noted
-    finally:
-        for name, function in kept.items():
-            setattr(wp, name, function)
 
 
 def load_kernels(

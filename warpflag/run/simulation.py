@@ -253,7 +253,7 @@ class Simulation:
         """Launches whatever a run launches, to find its kernels."""
         self._present_state()
         self._check_start()
-        self.stepper.launch_pass()
+        self._replay.launch_once()
         if self.stepper.dense is not None:
             take_rest(self.system.model, self.system.control, self.stepper.dense)
         self._checked = False

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import warp as wp
+from warpflag_kernels.base import program
 
 from warpflag.base.device import LAUNCHING
 from warpflag.stepping.stepper import Stepper
@@ -30,20 +30,23 @@ class Replay:
 
     def __init__(self, control: Any, stepper: Stepper, device: Any, capture: bool) -> None:
         self._control, self._stepper, self._device, self._capture = control, stepper, device, capture
-        self._graph: Any = None
+        self._replayed: Callable[[], None] | None = None
         self._passes = 200  # per replay
 
     def prepare(self) -> None:
         """Captures the pass, if that has not been done; all of its kernels are loaded."""
-        if not self._capture or self._graph is not None:
+        if not self._capture or self._replayed is not None:
             return
-        with wp.ScopedCapture(device=self._device) as captured:
-            wp.capture_while(self._control.proceed, self._stepper.launch_pass)
-        self._graph = captured.graph
+        self._replayed = program.captured_loop(self._control.proceed, self._stepper.launch_pass, self._device)
+
+    def launch_once(self) -> None:
+        """Launches one pass, and what replays it: with all of their kernels."""
+        self._stepper.launch_pass()
+        program.load(self._device)
 
     def forget(self) -> None:
         """Drops the captured pass: what it launches has changed."""
-        self._graph = None
+        self._replayed = None
 
     def advance(self, watch: Callable[[], None] | None = None, seconds: float = math.inf) -> None:
         """Replays the pass until no cell is short of its target.
@@ -71,8 +74,8 @@ class Replay:
                 watch()
 
     def _replay(self) -> None:
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
+        if self._replayed is not None:
+            self._replayed()
             return
         with LAUNCHING:
             while self._control.proceed.numpy()[0] > 0:

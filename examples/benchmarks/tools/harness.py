@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from warpflag_kernels.base.program import captured_loop, load
 
 Contender = Callable[[int], None]
 """Does its work so many times over."""
@@ -41,14 +42,13 @@ class Repeated:
             wp.launch(_count_down, 1, inputs=[self._left], device=device)
 
         turn()  # kernels load before the capture
-        with wp.ScopedCapture(device=device) as captured:
-            wp.capture_while(self._left, turn)
-        self._graph = captured.graph
+        load(wp.get_device(device))
+        self._replayed = captured_loop(self._left, turn, wp.get_device(device))
 
     def __call__(self, repeats: int) -> None:
         """Launches so many times, to the next multiple of `unroll`."""
         self._left.fill_(-(-repeats // self._unroll))
-        wp.capture_launch(self._graph)
+        self._replayed()
 
     @property
     def granularity(self) -> int:

@@ -1,0 +1,139 @@
+"""A pass of launches on a CPU as a program: its kernels and their arguments, found once and called one after another.
+
+Warp's own graph of a CPU looks up every kernel by name and packs its arguments anew at each replay, 0.1 us a launch and
+3 to 4 ns an array. An implicit step of two flagella has some sixty small kernels of a hundred arrays each: nearly a
+third of its time. Here each launch is a call of a function whose address is known, with arguments that lie ready.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpflag_kernels.base.native import plain
+
+_CALL, _UNLESS_ZERO, _GO = 0, 1, 2  # kinds of instructions, as in run_program.cpp
+
+
+@functools.cache
+def _kernel() -> Any:
+    module = wp.get_module("warpflag_kernels.program")
+
+    @wp.func_native(plain(Path(__file__).with_name("run_program.cpp")))
+    def run_program(instructions: wp.array(dtype=wp.int64), count: wp.int32): ...
+
+    @wp.kernel(module=module)
+    def run(
+        # Model:
+        instructions: wp.array(dtype=wp.int64),
+        count: wp.int32,
+    ):
+        run_program(instructions, count)
+
+    return run
+
+
+@contextlib.contextmanager
+def replaced(**functions: Callable[..., None]) -> Iterator[None]:
+    """While it lasts, functions of Warp are replaced by these, by name; no other thread may launch meanwhile."""
+    kept = {name: getattr(wp, name) for name in functions}
+    try:
+        for name, function in functions.items():
+            setattr(wp, name, function)
+        yield
+    finally:
+        for name, function in kept.items():
+            setattr(wp, name, function)
+
+
+class Program:
+    """Launches under conditions and in loops, in the order in which a function makes them.
+
+    Args:
+        body: makes them, by `wp.launch`, `wp.capture_if` and `wp.capture_while`; none of them is run.
+        device: Warp's CPU.
+
+    Attributes:
+        in_blocks: whether a kernel works in blocks of threads, which Warp has to schedule: then this can't be run.
+    """
+
+    def __init__(self, body: Callable[[], None], device: Any) -> None:
+        self.in_blocks = False
+        self._kept: list[Any] = []  # what the instructions point to
+        self._code: list[list[int]] = []
+        self._launch = wp.launch
+        with replaced(launch=self._add_call, capture_if=self._add_condition, capture_while=self._add_loop):
+            body()
+        instructions = wp.array(np.array(self._code, dtype=np.int64).ravel(), dtype=wp.int64, device=device)
+        command = self._launch(_kernel(), 1, inputs=[instructions, len(self._code)], device=device, record_cmd=True)
+        self._function, *self._arguments = self._packed(command)
+
+    def run(self) -> None:
+        """Runs it once, without Python's lock."""
+        self._function(*(ctypes.byref(x) for x in self._arguments))
+
+    def _packed(self, command: Any) -> tuple[Any, Any, Any]:
+        """The function of a launch on a CPU, its grid and its arguments."""
+        grid, *values = command.params
+        fields = [(f"argument_{i}", type(value)) for i, value in enumerate(values)]
+        packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
+        self._kept += [command, packed]  # the command holds the arrays and the module
+        return command.hooks.forward, grid, packed
+
+    def _add_call(self, kernel: Any, dim: Any, *arguments: Any, **options: Any) -> None:
+        command = self._launch(kernel, dim, *arguments, **options, record_cmd=True)
+        if command is None:  # of no threads
+            return
+        self.in_blocks |= command.block_dim > 1
+        function, grid, packed = self._packed(command)
+        address = ctypes.cast(function, ctypes.c_void_p).value or 0
+        self._code.append([_CALL, address, ctypes.addressof(grid), ctypes.addressof(packed)])
+
+    def _add_condition(self, condition: wp.array, on_true: Callable[..., None], **options: Any) -> None:
+        begin = len(self._code)
+        self._kept.append(condition)
+        self._code.append([_UNLESS_ZERO, condition.ptr, 0, 0])
+        on_true(**options)
+        self._code[begin][2] = len(self._code)
+
+    def _add_loop(self, condition: wp.array, while_body: Callable[..., None], **options: Any) -> None:
+        begin = len(self._code)
+
+        def body() -> None:
+            while_body(**options)
+            self._code.append([_GO, 0, begin, 0])
+
+        self._add_condition(condition, body)
+
+
+def captured_loop(condition: wp.array, body: Callable[[], None], device: Any) -> Callable[[], None]:
+    """What launches make, captured: a function that repeats them on the device for as long as a condition is not zero.
+
+    Args:
+        condition: of one integer, which launches change.
+        body: launches; their kernels are loaded.
+        device: of Warp; elsewhere than on a CPU, and with kernels in blocks, this is a graph of Warp's.
+    """
+
+    def loop() -> None:
+        wp.capture_while(condition, body)
+
+    if device.is_cpu and not (program := Program(loop, device)).in_blocks:
+        return program.run
+    with wp.ScopedCapture(device=device) as captured:
+        loop()
+    return functools.partial(wp.capture_launch, captured.graph)
+
+
+def load(device: Any) -> None:
+    """Launches the kernel that runs programs, with an empty one, where one is needed."""
+    if not device.is_cpu:
+        return
+    wp.launch(_kernel(), 1, inputs=[wp.zeros(1, dtype=wp.int64, device=device), 0], device=device)
