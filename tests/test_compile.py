@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import warp as wp
 import warpflag_kernels
+from warpflag_kernels.base import program
 from warpflag_kernels.base.plan import CONTACT_BLOCK
 from warpflag_kernels.stepping import dense_output
 
@@ -96,6 +97,7 @@ def launched(
         patch.setattr(wp, "capture_while", lambda _condition, body, **arguments: body(**arguments))
         sim.prepare(recording=True)
         sim.stepper.launch_pass()
+        program.load(sim.device)
         dense_output.take_rest(sim.system.model, sim.system.control, sim.stepper.dense)
         sim.evaluate()
         sim.cell_state()

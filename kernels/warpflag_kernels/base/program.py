@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import enum
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +20,13 @@ import warp as wp
 
 from warpflag_kernels.base.native import plain
 
-_CALL, _UNLESS_ZERO, _GO = 0, 1, 2  # kinds of instructions, as in run_program.cpp
+
+class _Kind(enum.IntEnum):
+    """Of an instruction, as in run_program.cpp; four integers each: the kind, and up to three values."""
+
+    CALL = 0  # a kernel: address of its function, of its grid, of its arguments
+    UNLESS_ZERO = 1  # go on with the next one, or elsewhere: address of a condition, instruction if that is zero
+    GO = 2  # elsewhere: 0, instruction
 
 
 @functools.cache
@@ -94,12 +101,12 @@ class Program:
         self.in_blocks |= command.block_dim > 1
         function, grid, packed = self._packed(command)
         address = ctypes.cast(function, ctypes.c_void_p).value or 0
-        self._code.append([_CALL, address, ctypes.addressof(grid), ctypes.addressof(packed)])
+        self._code.append([_Kind.CALL, address, ctypes.addressof(grid), ctypes.addressof(packed)])
 
     def _add_condition(self, condition: wp.array, on_true: Callable[..., None], **options: Any) -> None:
         begin = len(self._code)
         self._kept.append(condition)
-        self._code.append([_UNLESS_ZERO, condition.ptr, 0, 0])
+        self._code.append([_Kind.UNLESS_ZERO, condition.ptr, 0, 0])
         on_true(**options)
         self._code[begin][2] = len(self._code)
 
@@ -108,7 +115,7 @@ class Program:
 
         def body() -> None:
             while_body(**options)
-            self._code.append([_GO, 0, begin, 0])
+            self._code.append([_Kind.GO, 0, begin, 0])
 
         self._add_condition(condition, body)
 

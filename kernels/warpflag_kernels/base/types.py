@@ -135,8 +135,8 @@ def structs(p: Precision) -> SimpleNamespace:
         pairs: Pairs
         steric: Steric
         body: Body
-        # Optional terms: each an array of one struct, empty without the term. A launch passes on every array among its
-        # arguments, 3 to 4 ns each on a CPU, so each of these terms costs one.
+        # Optional terms: each an array of one struct, empty without the term, since all launches have all arrays among
+        # their arguments.
         motor_law: wp.array(dtype=MotorLaw)
         hook: wp.array(dtype=Hook)
         polymorphs: wp.array(dtype=Polymorphs)
