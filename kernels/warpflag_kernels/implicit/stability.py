@@ -83,7 +83,7 @@ def struct(p: Precision) -> Any:
 
 
 def allocate(model: DeviceModel) -> Any:
-    """The struct `Stability`, its probe a random vector with a share of every mode, the same in every run and cell."""
+    """The struct `Stability`, its probe a random increment with a share of every mode."""
     cells, device = model.cell_count, model.device
     s = struct(model.precision)()
     s.kappa, s.quotient = (wp.zeros(cells, dtype=wp.float64, device=device) for _ in range(2))
@@ -96,13 +96,10 @@ def allocate(model: DeviceModel) -> Any:
     h = np.minimum.reduceat(model.data.rod.segment_length.numpy().astype(float), first[:-1])
     alone = OVER_IMPLICIT_PER_KAPPA * KAPPA_ALONE * (0.05 / h) ** KAPPA_POWER
     s.least = wp.array(np.clip(alone, LEAST_OVER_IMPLICIT, MOST_OVER_IMPLICIT), dtype=wp.float64, device=device)
-    nodes = np.diff(model.data.first_node.numpy()[first])
     bending, stretching = _relaxation_rates(model)
     s.bending_rate = wp.array(bending, dtype=wp.float64, device=device)
     s.stretching_rate = wp.array(stretching, dtype=wp.float64, device=device)
-    probe = chain_chart.allocate(model)
-    probe.node.assign(np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes]))
-    s.probe = probe
+    s.probe = kept_increment.random(model)
     return s
 
 

@@ -10,6 +10,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warpflag_kernels.base.precision import Precision
@@ -88,6 +89,21 @@ def _kernels(p: Precision) -> SimpleNamespace:
         x.body[c] = vec6(u[0], u[1], u[2], w[0], w[1], w[2])
 
     return SimpleNamespace(turn_flagella=turn_flagella, turn_bodies=turn_bodies)
+
+
+def random(model: DeviceModel) -> Any:
+    """A kept increment of random numbers, the same in every run and cell, of bodies that rest; struct `Increment`.
+
+    That of a right-handed filament is the mirror image of a left-handed one's, so that mirrored cells move alike.
+    """
+    first_node = model.data.first_node.numpy()
+    nodes = np.diff(first_node[model.data.first_flagellum.numpy()])
+    x = np.concatenate([np.random.default_rng(0).standard_normal((n, 4)) / np.sqrt(n) for n in nodes])
+    twist = model.data.rod.rest_strain.numpy()[first_node[:-1] + 1, 2]
+    x[np.repeat(twist > 0.0, np.diff(first_node))] *= (1.0, -1.0, 1.0, -1.0)  # along e1, e2 and e3, and of the spin
+    increment = chain_chart.allocate(model)
+    increment.node.assign(x)
+    return increment
 
 
 def keep(model: DeviceModel, which: wp.array, pose: Any, x: Any) -> None:
