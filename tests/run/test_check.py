@@ -204,9 +204,13 @@ REVERSING = {"motor.switching": "markov", "motor.to_reverse": 1e4}  # within any
         ({"body.enabled": False, "flagella.count": 1, "motor.torque": -3.4}, "without a body"),
         ({"motor.torque": -3.4, "polymorphs.semicoiled": (0.0, 1.3, -2.1)}, "is the ground state"),
         ({"motor.torque": 1.2, "flagella.intrinsic_curvature": (0.0, 0.0, 2.1)}, None),  # straight, but it has a hand
+        ({"motor.torque": -2.0, "polymorphs.front_speed": 1000.0}, None),
+        ({"motor.torque": -2.0, "polymorphs.front_speed": 1001.0}, "front_speed 1001 um/s: beyond 1000 um/s"),
+        ({"motor.torque": -2.0, "polymorphs.ramp": 1e-4}, "ramp 0.0001 s, a front of 2000 um/s"),
+        ({"motor.torque": -2.0, "polymorphs.ramp": 2e-4, "polymorphs.front_speed": 1e4}, None),
     ],
 )
-def test_polymorphs_that_no_motor_can_reach_are_told(values, word):
+def test_polymorphs_that_no_motor_can_reach_or_that_change_too_fast_are_told(values, word):
     scene = small({"polymorphs.enabled": True, "flagella.length": 6.0, **values})
     found = of_polymorphs(scene, turning(scene))
     assert len(found) == (word is not None)
