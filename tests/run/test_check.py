@@ -91,11 +91,15 @@ def test_noise_turns_a_filament_as_rotational_diffusion_does():
 
 @pytest.mark.parametrize("duration", [2e-4, 2e-3, 0.5])
 def test_the_time_of_stepping_is_told_by_the_speed_of_a_sample(duration, monkeypatch):
-    """Of a cell that takes 1 s for the start, and then 2 s for a simulated millisecond."""
+    """Of a cell that takes 3 s to compile its kernels, 1 s for the start, and then 2 s for a simulated millisecond."""
     clock, scene = [0.0], small({"duration": duration, "frames": 10})
 
     class Steady:
         scenes, first_node, time = (scene,), np.array([0, 3]), 0.0
+
+        def load(self, recording):
+            clock[0] += 3.0
+            return 3.0
 
         def prepare(self, recording):
             clock[0] += 1.0
@@ -114,8 +118,8 @@ def test_the_time_of_stepping_is_told_by_the_speed_of_a_sample(duration, monkeyp
 
     monkeypatch.setattr("warpflag.run.check.time_needed.time", SimpleNamespace(process_time=lambda: clock[0]))
     found = needed(Steady())
-    assert found.startup == 1.0 and found.compiling == 0.0
-    assert found.stepping == pytest.approx(2e3 * duration) and found.sampled == pytest.approx(clock[0] - 1.0)
+    assert found.startup == 1.0 and found.compiling == 3.0
+    assert found.stepping == pytest.approx(2e3 * duration) and found.sampled == pytest.approx(clock[0] - 4.0)
 
 
 @pytest.mark.parametrize("spin", [1.26e-6, 3e-4])

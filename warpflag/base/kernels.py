@@ -6,6 +6,7 @@ import contextlib
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -50,7 +51,7 @@ def noted_launches() -> Iterator[set[tuple[Any, int | None]]]:
 
 def load_kernels(
     launch: Callable[[], None], device: Any, quiet: bool = False, explained_after: float = EXPLAINED_AFTER
-) -> None:
+) -> float:
     """Loads the kernels that a function launches; several modules at once are compiled where they are not in the cache.
 
     Args:
@@ -58,6 +59,9 @@ def load_kernels(
         device: of Warp.
         quiet: say nothing; otherwise compiling that lasts is explained on standard error.
         explained_after: how long it may last without a word [s].
+
+    Returns:
+        Computing time that compiling took [s]; 0 where all were in the cache.
     """
     with noted_launches() as noted:
         launch()
@@ -71,6 +75,7 @@ def load_kernels(
     if damaged and not quiet:
         tell(f"{len(damaged)} compiled modules in {kernel_folder()} were damaged, and are compiled again")
     missing = {path for path in folders if not path.exists()}.union(damaged)
+    began = time.process_time()
     if not missing:
         for module, block in waiting:
             _load(module, block, device)
@@ -82,8 +87,10 @@ def load_kernels(
                     loaded.result()
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)  # an interrupt does not wait for the others
+    compiling = time.process_time() - began if missing else 0.0
     keep_checksums(fresh)
     _LOADED_FOLDERS.update(folders)
+    return compiling
 
 
 def _load(module: Any, block: int | None, device: Any) -> None:

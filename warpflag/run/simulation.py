@@ -235,13 +235,13 @@ class Simulation:
         self._replay.prepare()
 
     @alone
-    def load(self, recording: bool = False, quiet: bool = False) -> None:
-        """Loads every kernel, of which `prepare` sees to the rest as well; arguments as there."""
+    def load(self, recording: bool = False, quiet: bool = False) -> float:
+        """Loads every kernel, the first part of `prepare`; arguments as there. Returns what compiling took [s]."""
         if recording and not self._frames.taken:
             self.take_frames()
-        if not self._loaded:
-            load_kernels(self._launch_all, self.device, quiet)
-            self._loaded = True
+        compiling = 0.0 if self._loaded else load_kernels(self._launch_all, self.device, quiet)
+        self._loaded = True
+        return compiling
 
     def take_frames(self) -> None:
         """Has the stepper take frames; a pass that was captured without is captured anew."""

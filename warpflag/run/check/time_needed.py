@@ -18,7 +18,6 @@ _MOST_SECONDS = 8.0  # of computing for all samples, so that the whole check tak
 _SETTLED = 4e-4  # simulated time [s] from which on steps have their usual length; those of the start are shorter
 _SHORTEST = 1e-9  # simulated time [s] that a sample is taken to have, where not one step came to its end
 _FRAMES_OBSERVED = 8  # frames whose observables are timed at once, as a run measures blocks of them
-_COLD = 6.0  # s of preparing, above which kernels have been compiled: with a warm cache it takes one
 _PER_FRAME = 1.5e-4  # s for the record of a frame; measured on zipping.toml
 MOVIE, _MOVIE_PER_NODE = 0.2, 5e-7  # s for a movie, and per node of a frame; measured on zipping.toml
 # Contacts ask for more and dearer steps. Time of stepping a whole run over what its first steps say, measured
@@ -74,10 +73,9 @@ def needed(simulation: Simulation, most: float = _MOST_SECONDS) -> Needed:
         NumericalError: a guard is violated in the first steps.
     """
     scene = simulation.scenes[0]
-    before = time.process_time()
+    compiling = simulation.load(recording=True)
     simulation.prepare(recording=True)
     startup = time.process_time()
-    compiling = startup - before if startup - before > _COLD else 0.0
     nodes = int(simulation.first_node[-1])
     output = scene.frames * (_observing(simulation) + _PER_FRAME + _MOVIE_PER_NODE * nodes) + MOVIE
     count = len(scene.resolved_flagella())
