@@ -51,7 +51,6 @@ flagella slip past each other."""
 PATIENCE = 20.0
 """Computing time that may go into following a run [s]."""
 _DISTURBANCE = {"float64": 1.0e-6, "float32": 1.0e-4}  # um, above round-off and far below contact distances
-_FEW_STEPS = 100.0  # of one pass each, up to which launching every kernel takes less than capturing them
 _LOOKS = 10  # at the pair while it is followed: growth is told at the first that shows it
 
 
@@ -180,8 +179,7 @@ def _looks(
         steps = {"numerics.time_step": taken, "numerics.accuracy": None}
         own = with_values(scene, {"numerics.on_accuracy": "warn", **steps})
         starts = [start, dataclasses.replace(start, positions=tuple(moved))]
-        many = own.numerics.stepper == "rkc" or _FEW_STEPS * taken < followed  # RKC: a pass for every stage
-        pair = Simulation([own, own], device=device, starts=starts, capture=many)
+        pair = Simulation([own, own], device=device, starts=starts)
         least, between = np.inf, 1.0
         for k in range(_LOOKS):
             within = followed * (k + 1) / _LOOKS
