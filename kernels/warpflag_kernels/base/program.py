@@ -47,6 +47,13 @@ def _kernel() -> Any:
     return run
 
 
+@functools.cache
+def _struct(kinds: tuple[type, ...]) -> type[ctypes.Structure]:
+    """A struct of values of these kinds, as C lays it out."""
+    fields = [(f"value_{i}", kind) for i, kind in enumerate(kinds)]
+    return type("Arguments", (ctypes.Structure,), {"_fields_": fields})
+
+
 @contextlib.contextmanager
 def replaced(**functions: Callable[..., None]) -> Iterator[None]:
     """While it lasts, functions of Warp are replaced by these, by name; no other thread may launch meanwhile."""
@@ -89,8 +96,7 @@ class Program:
     def _packed(self, command: Any) -> tuple[Any, Any, Any]:
         """The function of a launch on a CPU, its grid and its arguments."""
         grid, *values = command.params
-        fields = [(f"argument_{i}", type(value)) for i, value in enumerate(values)]
-        packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
+        packed = _struct(tuple(map(type, values)))(*values)
         self._kept += [command, packed]  # the command holds the arrays and the module
         return command.hooks.forward, grid, packed
 
