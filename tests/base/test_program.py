@@ -100,6 +100,38 @@ def test_loops_in_loops_end_where_their_conditions_are_zero(device, turns):
     assert sums.numpy().tolist() == [turns, 2 * turns]
 
 
+def test_arrays_are_copied_and_cleared_at_every_turn(device):
+    given, sums, kept = (wp.zeros(3, dtype=wp.int32, device=device) for _ in range(3))
+
+    def body() -> None:
+        wp.copy(kept, sums)
+        sums.zero_()
+        wp.launch(add, 1, inputs=[2, 1, sums], device=device)
+        wp.launch(add, 1, inputs=[1, 0, given], device=device)
+
+    run = capture(body, device)
+    sums.fill_(5)
+    given.zero_()
+    run()
+    assert sums.numpy().tolist() == [0, 2, 0] and kept.numpy().tolist() == [5, 5, 5]
+    run()
+    assert kept.numpy().tolist() == [0, 2, 0] and given.numpy()[0] == 2
+
+
+def test_what_would_not_be_repeated_is_refused():
+    sums, half = wp.zeros(4, dtype=wp.int32, device="cpu"), wp.zeros(2, dtype=wp.int32, device="cpu")
+    for body in (
+        lambda: sums.fill_(1),
+        lambda: sums.assign([1, 2, 3, 4]),
+        lambda: wp.copy(sums, half),
+        lambda: sums[::2].zero_(),
+    ):
+        with pytest.raises(RuntimeError, match="a captured pass"):
+            program.Program(body, wp.get_device("cpu"))
+    sums.fill_(3)
+    assert sums.numpy().tolist() == [3, 3, 3, 3]
+
+
 def test_kernels_in_blocks_of_fibers_are_left_to_warp(monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     sums = wp.zeros(2, dtype=wp.int32, device="cpu")

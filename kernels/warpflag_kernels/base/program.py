@@ -27,6 +27,8 @@ class _Kind(enum.IntEnum):
     CALL = 0  # a kernel: address of its function, of its grid, of its arguments
     UNLESS_ZERO = 1  # go on with the next one, or elsewhere: address of a condition, instruction if that is zero
     GO = 2  # elsewhere: 0, instruction
+    COPY = 3  # an array: address of the copy, of the array, bytes
+    CLEAR = 4  # an array: its address, 0, bytes
 
 
 @functools.cache
@@ -55,27 +57,39 @@ def _struct(kinds: tuple[type, ...]) -> type[ctypes.Structure]:
 
 
 @contextlib.contextmanager
-def replaced(**functions: Callable[..., None]) -> Iterator[None]:
-    """While it lasts, functions of Warp are replaced by these, by name; no other thread may launch meanwhile."""
-    kept = {name: getattr(wp, name) for name in functions}
+def replaced(owner: Any = wp, **functions: Callable[..., None]) -> Iterator[None]:
+    """While it lasts, functions of Warp, or of its arrays, are replaced; no other thread may launch meanwhile."""
+    kept = {name: getattr(owner, name) for name in functions}
     try:
         for name, function in functions.items():
-            setattr(wp, name, function)
+            setattr(owner, name, function)
         yield
     finally:
         for name, function in kept.items():
-            setattr(wp, name, function)
+            setattr(owner, name, function)
+
+
+def _refuse(array: wp.array, *_values: Any, **_options: Any) -> None:
+    raise RuntimeError(f"a captured pass launches, copies and clears, and sets no array of {array.dtype.__name__}")
+
+
+def _bytes(array: wp.array) -> int:
+    return array.size * wp.types.type_size_in_bytes(array.dtype)
 
 
 class Program:
     """Launches under conditions and in loops, in the order in which a function makes them.
 
     Args:
-        body: makes them, by `wp.launch`, `wp.capture_if` and `wp.capture_while`; none of them is run.
+        body: makes them, by `wp.launch`, `wp.capture_if` and `wp.capture_while`, beside `wp.copy` and `zero_` of whole
+            arrays; none of that is run.
         device: Warp's CPU.
 
     Attributes:
         in_blocks: whether a kernel works in blocks of threads, which Warp has to schedule: then this can't be run.
+
+    Raises:
+        RuntimeError: the body sets an array otherwise, which would not be repeated.
     """
 
     def __init__(self, body: Callable[[], None], device: Any) -> None:
@@ -83,7 +97,9 @@ class Program:
         self._kept: list[Any] = []  # what the instructions point to
         self._code: list[list[int]] = []
         self._launch = wp.launch
-        with replaced(launch=self._add_call, capture_if=self._add_condition, capture_while=self._add_loop):
+        recorded = {"launch": self._add_call, "capture_if": self._add_condition, "capture_while": self._add_loop}
+        set_whole = {"zero_": lambda array: self._add_clear(array), "fill_": _refuse, "assign": _refuse}
+        with replaced(wp, copy=self._add_copy, **recorded), replaced(wp.array, **set_whole):
             body()
         instructions = wp.array(np.array(self._code, dtype=np.int64).ravel(), dtype=wp.int64, device=device)
         command = self._launch(_kernel(), 1, inputs=[instructions, len(self._code)], device=device, record_cmd=True)
@@ -108,6 +124,20 @@ class Program:
         function, grid, packed = self._packed(command)
         address = ctypes.cast(function, ctypes.c_void_p).value or 0
         self._code.append([_Kind.CALL, address, ctypes.addressof(grid), ctypes.addressof(packed)])
+
+    def _add_copy(self, dest: wp.array, src: wp.array) -> None:
+        if not (dest.is_contiguous and src.is_contiguous and dest.size == src.size and dest.dtype is src.dtype):
+            raise RuntimeError("a captured pass copies whole arrays of one kind")
+        self._kept += [dest, src]
+        self._code.append(
+            [_Kind.COPY, dest.ptr or 0, src.ptr or 0, dest.size * wp.types.type_size_in_bytes(dest.dtype)]
+        )
+
+    def _add_clear(self, array: wp.array) -> None:
+        if not array.is_contiguous:
+            raise RuntimeError("a captured pass clears whole arrays")
+        self._kept.append(array)
+        self._code.append([_Kind.CLEAR, array.ptr or 0, 0, _bytes(array)])
 
     def _add_condition(self, condition: wp.array, on_true: Callable[..., None], **options: Any) -> None:
         begin = len(self._code)

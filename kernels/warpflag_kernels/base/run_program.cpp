@@ -11,7 +11,15 @@ for (int at = 0; at < count;) {
     case 1:  // a condition; where to go on if it is zero
         at = *reinterpret_cast<const int*>(now[1]) != 0 ? at + 1 : static_cast<int>(now[2]);
         break;
-    default:  // where to go on
+    case 2:  // where to go on
         at = static_cast<int>(now[2]);
+        break;
+    case 3:  // a copy, what is copied, bytes
+        memcpy(reinterpret_cast<void*>(now[1]), reinterpret_cast<const void*>(now[2]), static_cast<size_t>(now[3]));
+        ++at;
+        break;
+    default:  // an array to clear, bytes
+        memset(reinterpret_cast<void*>(now[1]), 0, static_cast<size_t>(now[3]));
+        ++at;
     }
 }
