@@ -26,13 +26,17 @@ LOCKED = {"motor.law": "rate", "motor.rate": 0.0}  # motors that do not turn
 STRAIGHT = {"flagella.intrinsic_curvature": (0.0, 0.0, 0.0), "flagella.opening_angle": 0.0, "motor.axis_angle": 0.0}
 
 
-def ensemble(values: dict[str, Any], count: int, sampled: bool = False) -> tuple[Scene, Simulation]:
+def ensemble(values: dict[str, Any], count: int, sampled: bool = False, first: int = 0) -> tuple[Scene, Simulation]:
     """Cells that differ in their seeds, of the paper's model unless the values say otherwise.
 
-    sampled: whether they start in equilibrium; hooks that resist bending start unbent.
+    Args:
+        values: of its keys.
+        count: of cells.
+        sampled: whether they start in equilibrium; hooks that resist bending start unbent.
+        first: seed.
     """
     scene = with_values(paper_scene("thermal"), {**BASE, **values})
-    scenes, random = [with_values(scene, {"fluid.seed": i}) for i in range(count)], np.random.default_rng(0)
+    scenes, random = [with_values(scene, {"fluid.seed": first + i}) for i in range(count)], np.random.default_rng(first)
     shapes = [in_equilibrium(scene, KT, random) for _ in scenes] if sampled else None
     return scene, Simulation(scenes, device="cpu", starts=shapes)
 

@@ -17,16 +17,16 @@ def drift(share: float) -> None:
     """Mean velocity of a passive helix along its own axis [um/s], exactly zero."""
     print("\n| cell | step [s] | drift [µm/s] |\n|---|---|---|")
     cases = (
-        ("free, 6 µm", FREE, 1e-5),
-        ("free, 6 µm", FREE, 1e-6),
-        ("on a body, 6 µm", {}, 1e-5),
-        ("on a body, 6 µm", {}, 1e-6),
-        ("on a body with its flow and a hook, 6 µm", {**FLOW, **HOOKED}, 1e-5),
+        ("free, 6 µm", FREE, 1e-5, 1000),
+        ("free, 6 µm", FREE, 1e-6, 2500),
+        ("on a body, 6 µm", {}, 1e-5, 1000),
+        ("on a body, 6 µm", {}, 1e-6, 2500),
+        ("on a body with its flow and a hook, 6 µm", {**FLOW, **HOOKED}, 1e-5, 1600),
     )
-    for name, values, step in cases:
-        _, sim = ensemble({**values, "numerics.time_step": step}, 64)
+    for row, (name, values, step, steps) in enumerate(cases, 1):
+        _, sim = ensemble({**values, "numerics.time_step": step}, 64, first=64 * row)
         way, before = np.zeros(64), None
-        count = max(20, int(share * 400))
+        count = max(20, int(share * steps))
         for cells in looks(sim, 2e-4, step, count):
             x = cells.positions.reshape(64, 31, 3)
             axis = x[:, -1] - x[:, 1]
@@ -86,7 +86,7 @@ NAMES = ("along [µm²/s]", "across [µm²/s]", "spin [rad²/s]", "tumble [rad²
 def diffusion(share: float) -> None:
     """A free helix of 6 um: mean square displacements in its own axes, between lags of 0.5 and 1.5 ms."""
     _, sim = ensemble({**FREE, "numerics.time_step": 1e-5}, 96)
-    interval, count = 5e-4, max(16, int(share * 80))
+    interval, count = 5e-4, max(16, int(share * 160))
     shapes = np.array([c.positions.reshape(96, 31, 3) for c in looks(sim, 2e-3, interval, count)])
     reference = Simulation(sim.scenes[0], device="cpu").state.positions
     second = reference[1:-3] + reference[3:-1] - 2 * reference[2:-2]
@@ -150,7 +150,7 @@ def swimmer(share: float) -> None:
         "numerics.time_step": 5e-5,
         **LOCKED,
     }
-    count, interval = 32, 0.02
+    count, interval = 64, 0.02
     scene, sim = ensemble(values, count)
     rest = Simulation(scene, device="cpu").state
     nodes = [x - rest.body_position for x in np.split(rest.positions, 2)]
