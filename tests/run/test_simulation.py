@@ -17,7 +17,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter
 from warpflag.run import run
 from warpflag.run.simulation import NumericalError, Simulation
-from warpflag.scene import SceneError, loads
+from warpflag.scene import SceneError, loads, with_values
 
 STEPPERS = {
     "rkc": {"numerics.stepper": "rkc"},
@@ -170,6 +170,24 @@ def test_a_record_that_is_not_finite_is_no_start(what, tmp_path):
     recorder.close()
     with pytest.raises(SceneError, match="not finite"):
         Simulation(small({"start.record": str(tmp_path)}), device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("fluid.seed", {"fluid.temperature": 300.0, "hydrodynamics.mode": "none", "motor.bearing_torque": True}),
+        ("motor.seed", {"motor.switching": "markov"}),
+    ],
+)
+def test_random_numbers_do_not_come_again(key, values, tmp_path):
+    """A run counts its steps from 0: going on with the seed of before it would repeat the random numbers."""
+    directory = executed(small({**values, key: 5}), tmp_path / "made")
+    going_on = small({**values, key: 5, "start.record": str(directory)})
+    with pytest.raises(SceneError, match="again") as error:
+        Simulation(going_on, device="cpu")
+    assert error.value.key == key
+    for other in ({key: 6}, {"start.frame": 0}):  # another seed; the same run from its start
+        Simulation(with_values(going_on, other), device="cpu")
 
 
 def test_a_run_that_started_from_a_record_resumes_without_it(tmp_path):

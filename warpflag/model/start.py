@@ -8,7 +8,7 @@ from warpflag.base import rotations
 from warpflag.model.clear_start import body_gaps, clear_start
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.record import Frame, Record, RecordError
-from warpflag.scene import Scene, SceneError, attachment
+from warpflag.scene import Scene, SceneError, attachment, loads
 
 __all__ = ["check_outside", "shape_of_frame", "starting_state"]
 
@@ -35,6 +35,8 @@ def starting_state(scene: Scene) -> InitialState:
                 problem = f"{record.path} holds frames 0 to {record.frame_count - 1}"
                 raise SceneError("start.frame", scene.start.frame, problem, ["start.record"])
             first_node, frame = record.first_node, record.frame(scene.start.frame)
+            if frame.step > 0:
+                _check_seeds(scene, record)
     except RecordError as error:
         raise SceneError(*_record_of(scene), str(error)) from None
     counts = [spec.segment_count for spec in scene.resolved_flagella()]
@@ -70,6 +72,24 @@ def check_outside(scene: Scene, start: InitialState) -> None:
         if gaps.min() < 0.0:
             deep = f"node {int(gaps.argmin()) + 1} is {-gaps.min():.3g} um deep"
             raise SceneError("body.contact", True, f"the given start has flagellum {k} inside the body: {deep}")
+
+
+def _check_seeds(scene: Scene, record: Record) -> None:
+    """A run counts its steps from 0: with the seed of the run that it goes on from, which has made the shape that it
+    starts with, the same random numbers would come again."""
+    try:
+        made = loads(record.scene_text)
+    except SceneError:
+        return  # of another version, whose random numbers were others
+    noisy = min(scene.fluid.temperature, made.fluid.temperature) > 0.0
+    switching = scene.motor.switching == made.motor.switching == "markov"
+    for key, random, seed, other in (
+        ("fluid.seed", noisy, scene.fluid.seed, made.fluid.seed),
+        ("motor.seed", switching, scene.motor.seed, made.motor.seed),
+    ):
+        if random and seed == other:
+            problem = f"is the seed of {record.path}, whose random numbers would come again; take another"
+            raise SceneError(key, seed, problem, ["start.record"])
 
 
 def _check_finite(scene: Scene, start: InitialState) -> None:

@@ -26,7 +26,7 @@ HOOKED = {"hook.length": 0.055, "hook.stiffness": 0.65}
 UNBENT = {"hook.length": 0.055, "hook.stiffness": 4.0, "flagella.opening_angle": 110.0, "flagella.on_axis": True}
 # Cell, values, step, cells, start, interval of the looks [s], number of looks. Cells without a stiff hook start in
 # equilibrium, joint by joint; the stepper's own takes the place of that within the time to the start.
-LONG = ((1e-6, 160, 2e-4, 1e-4, 50), (1e-5, 192, 5e-4, 1e-4, 150))
+LONG = ((1e-6, 128, 2e-4, 4e-6, 900), (1e-5, 128, 5e-4, 2e-5, 450))
 CASES: list[tuple[str, dict[str, Any], float, int, float, float, int]] = [
     *(("free, 1.2 µm", {**FREE, **SHORT}, step, 300, 20 * step, 2 * step, 300) for step in (1e-6, 1e-5)),
     *(("two on a body, 1.2 µm", {**TWO, **SHORT}, step, 200, 20 * step, 2 * step, 300) for step in (1e-6, 1e-5)),

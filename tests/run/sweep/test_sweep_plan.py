@@ -108,6 +108,8 @@ def test_every_draw_and_repeat_has_random_numbers_of_its_own(section, values, fo
     seeds = np.array([getattr(m.scene, section).seed for m in members(folder, text)]).reshape(2, 6)
     assert seeds[0, 0] == 7 and len(set(seeds[0])) == 6
     np.testing.assert_array_equal(seeds[0], seeds[1])
+    others = [getattr(m.scene, section).seed for m in members(folder, text.replace("seed = 7", "seed = 8"))]
+    assert not set(others) & set(seeds[0])  # a sweep of another seed is more samples, none of them twice
 
 
 def test_normal_spreads_have_their_mean_and_deviation(folder):

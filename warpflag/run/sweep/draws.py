@@ -1,7 +1,8 @@
 """What is random in a sweep: values per cell or per flagellum, and where the flagella are anchored.
 
 Every value has a stream of random numbers of its own, made from the seed, its key, its draw and its repeat: another
-axis, key or draw does not change it, and members at different axis values share their draws.
+axis, key or draw does not change it, and members at different axis values share their draws. So do seeds of noise and
+of switching motors, which depend on that of the base, too.
 """
 
 from __future__ import annotations
@@ -78,10 +79,14 @@ class Draws:
             for k, (azimuth, offset) in enumerate(self._placed(with_values(scene, values), draw, repeat)):
                 values |= {f"flagellum.{k}.azimuth": azimuth, f"flagellum.{k}.anchor_offset": offset}
         if scene.fluid.temperature > 0.0 and (draw or repeat):
-            values["fluid.seed"] = int(self._stream("fluid.seed", draw, repeat).integers(2**31))
+            values["fluid.seed"] = self._seed_of("fluid.seed", scene.fluid.seed, draw, repeat)
         if scene.motor.switching == "markov" and (draw or repeat):
-            values["motor.seed"] = int(self._stream("motor.seed", draw, repeat).integers(2**31))
+            values["motor.seed"] = self._seed_of("motor.seed", scene.motor.seed, draw, repeat)
         return values
+
+    def _seed_of(self, key: str, base: int, draw: int, repeat: int) -> int:
+        """A seed for the random numbers of a member; those of bases with other seeds have nothing in common."""
+        return int(self._stream(f"{key} {base}" if base else key, draw, repeat).integers(2**31))
 
     def _stream(self, key: str, draw: int, repeat: int | None = None) -> np.random.Generator:
         return np.random.default_rng(
