@@ -87,6 +87,20 @@ def test_noise_turns_a_filament_as_rotational_diffusion_does():
     assert of_noise(small(), 1e-6) == []
     assert "miss contacts" in of_noise(scene, 5e-6)[-1]
     assert len(of_noise(with_values(scene, {"steric.enabled": False}), 5e-6)) == 2
+    # A hook that resists bending holds it: <x^2> = 2 kT/k L^2; a free one lets it point anywhere: 2 L^2.
+    for stiffness, far in ((4.0, math.sqrt(2 * energy / 4.0) * 3.0), (0.0, math.sqrt(2) * 3.0)):
+        longest = with_values(scene, {"hook.stiffness": stiffness, "duration": 10.0})
+        found = re.search(r"tip by about ([\d.]+) um", of_noise(longest, 1e-6)[1])
+        assert found is not None and float(found[1]) == pytest.approx(far, rel=0.05)
+
+
+def test_noise_that_stretches_segments_too_far_is_told():
+    """The 5 % of the guard are six standard deviations sqrt(kT/(K h)) at 1000 K."""
+    values = {"fluid.temperature": 1000.0, "hydrodynamics.mode": "none", "motor.bearing_torque": True}
+    hot = small({**values, "flagella.stretching_stiffness": 1000.0, "flagella.segment_length": 0.2})
+    assert len(of_noise(hot, 1e-6)) == 2
+    for other in ({"fluid.temperature": 1100.0}, {"flagella.segment_length": 0.1}):
+        assert "stretches segments by" in of_noise(with_values(hot, other), 1e-6)[2]
 
 
 @pytest.mark.parametrize("duration", [2e-4, 2e-3, 0.5])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from warpflag_kernels.stepping.health import LARGEST_STRAIN
 
 from warpflag.scene import Scene
 from warpflag.scene.resistance import filament_mobility, thermal_energy
@@ -13,6 +14,8 @@ __all__ = ["of_noise"]
 
 SOUND_IN_CONTACT = 2.0e-6
 """Longest step that has missed no contact of two filaments that lie side by side [s]."""
+DEVIATIONS = 6.0
+"""Standard deviations that a segment seldom exceeds in a run: chance 2e-9 each time, of 1e7 or 1e8 times."""
 
 
 def of_noise(scene: Scene, step: float) -> list[str]:
@@ -24,8 +27,16 @@ def of_noise(scene: Scene, step: float) -> list[str]:
     mobility = filament_mobility(scene, spec.segment_length)
     # Of the straight line from anchor to tip, as a rod that turns about its anchor by its drag across.
     long = spec.length * _axial_share(scene)
-    drag = long**3 / (3 * mobility.across * spec.segment_length)
-    tip = long * math.sqrt(4 * energy / drag * scene.duration)
+    drag, stiffness = long**3 / (3 * mobility.across * spec.segment_length), scene.hook.stiffness
+
+    def tip(time: float) -> float:
+        """How far it moves [um]: about each axis it turns by v, on a hook that resists bending up to v = kT/k; the mean
+        cosine of the whole turn is exp(-v)."""
+        v = 2 * energy * time / drag
+        if stiffness > 0.0:
+            v = -energy / stiffness * math.expm1(-2 * stiffness * time / drag)
+        return long * math.sqrt(-2 * math.expm1(-v))
+
     method = {
         "euler": "Euler-Maruyama",
         "rkc": "RKC of two stages, the noise held over a step",
@@ -35,9 +46,16 @@ def of_noise(scene: Scene, step: float) -> list[str]:
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
         "joints err by up to 1 % at 1e-5 s, gaps of contacts by 5 % at 1e-6 s, driven motion in proportion to the "
         "step: halve it and compare",
-        f"noise alone turns a flagellum about its hook: tip by about {tip:.2g} um in {1e3 * scene.duration:g} ms, "
-        f"{tip * math.sqrt(step / scene.duration):.1g} um in a step",
+        f"noise alone turns a flagellum about its hook: tip by about {tip(scene.duration):.2g} um in "
+        f"{1e3 * scene.duration:g} ms, {tip(step):.1g} um in a step",
     ]
+    shortest = min(own.segment_length for own in scene.resolved_flagella())
+    strain = math.sqrt(energy / (scene.flagella.stretching_stiffness * shortest))
+    if DEVIATIONS * strain > LARGEST_STRAIN:
+        said.append(
+            f"noise stretches segments by {100 * strain:.2g} % rms, and the run stops at {100 * LARGEST_STRAIN:g} %: "
+            "take a lower fluid.temperature, a higher flagella.stretching_stiffness or longer segments"
+        )
     several = len(scene.resolved_flagella()) > 1
     if step > SOUND_IN_CONTACT and scene.steric.enabled and (several or scene.steric.self_contact):
         said.append(
