@@ -3,8 +3,8 @@
     uv run --extra plot examples/thermal/noisy_zip.py --seeds 64 -o noisy_zip.png --times noisy_zip.csv
     uv run --extra plot examples/thermal/noisy_zip.py --from noisy_zip.csv -o noisy_zip.png      # the picture alone
 
-A batch per torque, whose cells leave it when their bundle is complete; steps of 2 us. Beside them the zip time
-without noise. Without an output no picture is drawn.
+Cells leave their batch when their bundle is complete; steps of 2 us. Beside them the zip time without noise. Times are
+written batch by batch. Without an output no picture is drawn.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import csv
 import math
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -47,14 +49,39 @@ def zip_times(torque: float, duration: float, step: float, interval: float, seed
     return found
 
 
-def simulated(seeds: int, first: int) -> dict[float, tuple[np.ndarray, float]]:
-    """Zip times [ms] of all seeds and without noise, by torque."""
+def simulated(
+    torques: list[float], seeds: range, batch: int, keep: Callable[[float, Sequence[int], np.ndarray], None]
+) -> dict[float, tuple[np.ndarray, float]]:
+    """Zip times [ms] of all seeds and without noise, by torque; `keep` gets those of every batch, with their seeds."""
     found = {}
     for torque, duration, step, interval in RUNS:
-        times = 1e3 * zip_times(torque, duration, step, interval, seeds, first)
-        quiet = 1e3 * float(zip_times(torque, duration, step, interval, 0, 0)[0])
-        found[torque] = times, quiet
-        tell(torque, 1e3 * duration, times, quiet)
+        if torque not in torques:
+            continue
+        quiet = 1e3 * zip_times(torque, duration, step, interval, 0, 0)
+        keep(torque, [QUIET], quiet)
+        times = []
+        for i in range(0, len(seeds), batch):
+            own = seeds[i : i + batch]
+            times.append(1e3 * zip_times(torque, duration, step, interval, len(own), own[0]))
+            keep(torque, own, times[-1])
+        found[torque] = np.concatenate(times), float(quiet[0])
+        tell(torque, 1e3 * duration, *found[torque])
+    return found
+
+
+def read(paths: list[str]) -> dict[float, tuple[np.ndarray, float]]:
+    """What files of zip times hold, as `simulated` returns it."""
+    rows = []
+    for path in paths:
+        with open(path, newline="") as file:
+            rows += [[float(x) for x in row] for row in list(csv.reader(file))[1:]]
+    found = {}
+    for torque, duration, *_ in RUNS:
+        times = {seed: t for own, seed, t in rows if own == torque}  # none twice
+        if times:
+            quiet = times.pop(QUIET)
+            found[torque] = np.array(list(times.values())), quiet
+            tell(torque, 1e3 * duration, *found[torque])
     return found
 
 
@@ -94,30 +121,27 @@ def draw(found: dict[float, tuple[np.ndarray, float]], output: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--torques", type=float, nargs="+", default=[run[0] for run in RUNS], help="some [pN um]")
     parser.add_argument("--seeds", type=int, default=64)
     parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--batch", type=int, default=64, help="cells that are advanced together")
     parser.add_argument("--times", help="CSV file for the zip times")
-    parser.add_argument("--from", dest="source", help="such a file, instead of runs")
+    parser.add_argument("--from", dest="sources", nargs="+", help="such files, instead of runs")
     parser.add_argument("-o", "--output", help="picture")
     chosen = parser.parse_args()
-    if chosen.source:
-        with open(chosen.source, newline="") as file:
-            rows = [[float(x) for x in row] for row in list(csv.reader(file))[1:]]
-        found = {}
-        for torque, duration, *_ in RUNS:
-            times = np.array([t for own, seed, t in rows if own == torque and seed != QUIET])
-            quiet = next(t for own, seed, t in rows if own == torque and seed == QUIET)
-            found[torque] = times, quiet
-            tell(torque, 1e3 * duration, times, quiet)
+    if chosen.sources:
+        found = read(chosen.sources)
     else:
-        found = simulated(chosen.seeds, chosen.first)
-    if chosen.times:
-        with open(chosen.times, "w", newline="") as file:
+        with open(chosen.times or os.devnull, "w", newline="") as file:
             out = csv.writer(file)
             out.writerow(COLUMNS)
-            for torque, (times, quiet) in found.items():
-                out.writerow([torque, QUIET, f"{quiet:.3f}"])
-                out.writerows([torque, chosen.first + i, f"{t:.3f}"] for i, t in enumerate(times))
+
+            def keep(torque: float, seeds: Sequence[int], times: np.ndarray) -> None:
+                out.writerows([torque, seed, f"{t:.3f}"] for seed, t in zip(seeds, times, strict=True))
+                file.flush()
+
+            seeds = range(chosen.first, chosen.first + chosen.seeds)
+            found = simulated(chosen.torques, seeds, chosen.batch, keep)
     if chosen.output:
         draw(found, chosen.output)
 
