@@ -11,7 +11,7 @@ from warpflag import observables
 from warpflag.record import RECORD_NAME, Frame
 from warpflag.record.recorder import Recorder
 from warpflag.record.reporters import start_reporter
-from warpflag.scene import paper_scene
+from warpflag.scene import paper_scene, with_values
 
 
 def helix(node_count, *, axis_offset=(0.0, 0.0, 0.0), phase=0.0, radius=0.22, pitch=2.14, h=0.2, handedness=-1):
@@ -56,6 +56,7 @@ class Zipping:
     The front starts at 40 % of the contour and moves at 100 contours a second from 1 ms on; before, nothing is bundled.
     All of it in axes turned in the lab. Frames every 0.05 ms to 8 ms.
 
+    values: of the scene that the record names, whatever the shape.
     split: how fast the second flagellum leaves the first at the front [um of distance per um of contour]; 0: at once, a
     segment across, which no axis of a turn survives.
     """
@@ -63,9 +64,9 @@ class Zipping:
     helix_rate, motor_rate, body_rate, body_speed = 300.0, 400.0, -60.0, 150.0
     pitch, segments, start, onset, front_speed = -2.14, 30, 0.4, 1e-3, 100.0
 
-    def __init__(self, directory: Path, split: float = 0.0) -> None:
+    def __init__(self, directory: Path, split: float = 0.0, values: dict | None = None) -> None:
         self.directory, self.split = directory, split
-        self.scene = paper_scene(name="made-up")
+        self.scene = with_values(paper_scene(name="made-up"), values or {})
         self.times = 5e-5 * np.arange(161)
         first_node = np.array([0, 31, 62])
         recorder = Recorder(directory / RECORD_NAME)

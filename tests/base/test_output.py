@@ -7,7 +7,8 @@ import os
 
 import pytest
 
-from warpflag.base.output import DiskError, OutputError, whole
+from warpflag.base import output
+from warpflag.base.output import DiskError, OutputError, sync_file_systems, whole
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -59,3 +60,20 @@ def test_a_full_disk_is_told_of_the_file_and_another_file_of_itself(tmp_path):
         (tmp_path / "other.txt").read_text()
     with pytest.raises(DiskError, match=r"^inner\.h5: can't be written: full$"), whole(path):
         raise DiskError.of("inner.h5", RuntimeError("full"))
+
+
+def test_a_device_that_could_not_store_all_is_told(tmp_path, monkeypatch):
+    asked: list[int] = []
+
+    class Library:
+        @staticmethod
+        def syncfs(descriptor: int) -> int:
+            asked.append(os.fstat(descriptor).st_dev)
+            return -1
+
+    monkeypatch.setattr(output.ctypes, "CDLL", lambda *_, **__: Library)
+    monkeypatch.setattr(output.ctypes, "get_errno", lambda: errno.EIO)
+    with pytest.raises(OSError) as caught:
+        sync_file_systems([tmp_path, tmp_path.parent])
+    assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(tmp_path.parent))
+    assert asked == [tmp_path.stat().st_dev]  # once for the device

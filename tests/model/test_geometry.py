@@ -350,6 +350,7 @@ def test_on_its_axis_a_flagellum_starts_there_and_ends_as_the_helix(h):
     # Beyond the taper the intrinsic strain is the helix's, and the shape has no energy anywhere.
     strains = joint_strains(tangents(nodes), e1)
     assert strains[beyond:] == pytest.approx(np.tile(h * np.array(NORMAL), (len(strains) - beyond, 1)), abs=1e-9)
+    assert strains[:, 2] == pytest.approx(h * NORMAL[2], abs=1e-9)  # on the taper only the bends differ
 
 
 @pytest.mark.parametrize("offset", [1.25, 1.1, -0.9])

@@ -114,6 +114,15 @@ def test_parameters_are_measured_from_a_record(tmp_path):
     assert found.phase_velocity == pytest.approx(-made.pitch * made.helix_rate, rel=0.05)
 
 
+def test_the_opening_angle_is_that_between_the_helix_axes(tmp_path):
+    """Of tilts of 60 and 30 degrees at azimuths of 100 and 40: cos Phi = cos 60 cos 30 + sin 60 sin 30 cos 60."""
+    values = {"flagellum.0.azimuth": 100.0, "flagellum.0.tilt": 60.0, "flagellum.1.azimuth": 40.0}
+    made = Zipping(tmp_path, split=0.5, values={**values, "flagellum.1.tilt": 30.0})
+    with Record(made.directory) as record:
+        found = zipper.measured(record, 1e-3, 2e-3)
+    assert found.opening_angle == pytest.approx(math.degrees(math.acos(math.sqrt(3) / 4 + math.sqrt(3) / 8)))
+
+
 def test_zipping_is_found_in_a_record_and_fitted(made):
     with Record(made.directory) as record:
         times, lengths = zipper.zipping(record)

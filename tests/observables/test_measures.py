@@ -77,6 +77,29 @@ def test_elastic_energy_by_term():
     np.testing.assert_allclose(found[:2], [3.5 / 2 * 0.2 * 29 / 2.0**2, 0.0], rtol=2e-3, atol=1e-12)
 
 
+def test_a_hook_stiffens_alike_under_both_senses_of_the_torque():
+    """By 1 + |T_m|/T_s: bent, it stores 1.75 times as much at 1.5 pN um and T_s = 2 pN um as without stiffening."""
+    scene = with_values(paper_scene(name="hook"), {"hook.stiffness": 0.65, "motor.axis_angle": 55.0})
+    positions, directors = arrays(initial_state(scene))
+    axes, first_node = observables.motor_axes(scene), np.array([0, 31, 62])
+    stored = [
+        observables.elastic_energy(with_values(scene, values), positions, directors, axes, first_node)[0]
+        for values in ({}, *({"hook.stiffening_torque": 2.0, "motor.torque": t} for t in (1.5, -1.5)))
+    ]
+    assert stored[0] > 1e-3
+    np.testing.assert_allclose(stored, stored[0] * np.array([1.0, 1.75, 1.75]), rtol=1e-9)
+
+
+def test_force_density_is_over_the_mean_length_of_the_flagella(tmp_path):
+    densities = []
+    for k, values in enumerate(({}, {"flagellum.0.length": 4.0, "flagellum.1.length": 5.0})):
+        (tmp_path / f"{k}").mkdir()
+        made = Zipping(tmp_path / f"{k}", values={"steric.diameter": 0.4, **values})
+        with Record(made.directory) as record:
+            densities.append(recorded.steric_force_densities(record)[-1])
+    assert 4.5 * densities[1] == pytest.approx(6.0 * densities[0], rel=1e-12) and densities[0] > 0.0
+
+
 @pytest.mark.parametrize("handedness", [-1, 1])
 def test_axis_and_pitch_of_a_helix_anywhere(handedness):
     nodes, _ = helix(31, pitch=2.0, handedness=handedness)

@@ -16,6 +16,7 @@ from examples.reliability.damage import damaged
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.record import Record, RecordError
 from warpflag.record.layout import checksums
+from warpflag.record.recorder import Recorder
 
 FRAMES = 70  # more than a chunk of 64
 MUTATIONS = 300
@@ -89,6 +90,31 @@ def test_one_flipped_bit_of_a_frame_is_found_and_the_other_frames_stay_readable(
         np.testing.assert_array_equal(record.positions[6:9], [frame(i).positions for i in (6, 7, 8)])
         with pytest.raises(RecordError):
             record.frame(5)
+
+
+def test_the_damaged_frame_is_named_wherever_reading_begins(tmp_path):
+    path = written(tmp_path / "run.h5", FRAMES)
+    with h5py.File(path, "r+") as file:
+        file["observables/bundle_length/value"][67] += 1.0
+    with Record(path) as record, pytest.raises(RecordError, match=r"frame 67 of /observables/bundle_length"):
+        record.frame(67)
+    with h5py.File(path, "r+") as file:
+        file["particles/flagella/position/value"][66] += 1.0
+    with Record(path) as record, pytest.raises(RecordError, match=r"frame 66 of /particles/flagella/position"):
+        _ = record.positions[60:]
+
+
+def test_other_versions_are_found_and_a_run_that_goes_on_gives_its_own(tmp_path):
+    path = written(tmp_path / "run.h5", 3)
+    recorder = Recorder(path, resume_step=20)
+    sizes = {"filament_radius": 0.01, "body_length": 2.5, "body_width": 0.8}
+    recorder.start(SCENE, FIRST_NODE, **sizes, versions={"warpflag": "1.2.4"})
+    recorder.close()
+    with Record(path) as record:
+        assert record.versions == {"warpflag": "1.2.4"}
+    with h5py.File(path, "r+") as file:
+        file["parameters/versions"].attrs["warpflag"] = "1.2.5"
+    assert "/parameters does not agree with its checksum" in refusal(path)
 
 
 @pytest.mark.parametrize(

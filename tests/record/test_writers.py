@@ -48,13 +48,15 @@ def start_writer(path: Path, *, wait: bool) -> subprocess.Popen:
 def test_another_process_reads_while_a_run_writes(tmp_path):
     with start_writer(tmp_path / "run.h5", wait=True) as process:
         assert process.stdin is not None and process.stdout is not None
-        for committed in (1, 11, 21):
-            assert int(process.stdout.readline()) == committed
-            with Record(tmp_path) as record:
-                assert_holds_frames(record, range(committed))
-            process.stdin.write("on\n")
-            process.stdin.flush()
-        process.kill()
+        try:
+            for committed in (1, 11, 21):
+                assert int(process.stdout.readline()) == committed
+                with Record(tmp_path) as record:
+                    assert_holds_frames(record, range(committed))
+                process.stdin.write("on\n")
+                process.stdin.flush()
+        finally:  # or a failure would wait for the writer
+            process.kill()
 
 
 def test_a_record_opens_at_any_moment_of_a_run_that_writes_without_pause(tmp_path):
@@ -64,10 +66,12 @@ def test_a_record_opens_at_any_moment_of_a_run_that_writes_without_pause(tmp_pat
         process.stdout.readline()
         said = pool.submit(process.stdout.read)  # or the writer would wait for its reader
         counts = []
-        for _ in range(60):
-            with Record(path) as record:
-                counts.append(record.frame_count)
-        process.kill()
+        try:
+            for _ in range(60):
+                with Record(path) as record:
+                    counts.append(record.frame_count)
+        finally:  # or a failure would wait for the writer
+            process.kill()
         said.result()
     assert counts == sorted(counts) and counts[-1] > counts[0]
 

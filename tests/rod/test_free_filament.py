@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tests.oracles import drag_coefficients, elastic_energies, expected_pair_rad
 from tests.plans import as_on_gpu, by_elements, plan
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.observables import power_balance
+from warpflag.record.reporters import start_reporter
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, SceneError, with_values
 
@@ -81,6 +83,13 @@ def test_power_of_the_pull_is_dissipation_and_stored_energy(precision, device):
 
     step = 1e-5 / max(np.abs(found.velocities).max(), np.abs(found.spins).max())
     assert abs(balance.stored - slope(at, step)) < POWER[precision] * balance.dissipated
+
+
+def test_its_record_has_a_sphere_as_thick_as_the_filament_in_place_of_the_body():
+    told: dict[str, float] = {}
+    reporter = SimpleNamespace(start=lambda *_, **sizes: told.update(sizes))
+    start_reporter(reporter, free({"flagella.filament_radius": 0.015}), np.array([0, 11]))
+    assert (told["filament_radius"], told["body_length"], told["body_width"]) == (0.015, 0.03, 0.03)
 
 
 def hook_twist(scene: Scene, start: InitialState) -> float:

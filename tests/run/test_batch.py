@@ -49,6 +49,18 @@ def test_members_equal_their_single_runs_to_the_last_bit(stepper, device, precis
     assert (batch.times == 3.5e-5).all()
 
 
+def test_a_stiff_member_beside_a_soft_one_is_that_of_its_single_run(device, precision):
+    """The full mobility is solved with in the first member alone."""
+    rods = {"flagella.bending_rigidity": 350.0, "flagella.twist_rigidity": 350.0, "flagella.stretching_stiffness": 1e5}
+    common = {"numerics.stepper": "implicit", "hydrodynamics.mode": "consistent"}
+    scenes = [cell({**rods, **common}, precision), cell(common, precision)]
+    batch, alone = Simulation(scenes, device=device), Simulation(scenes[0], device=device)
+    for sim in (batch, alone):
+        sim.advance(5e-5)
+    assert batch.stepper.memory()["strong"].tolist() == [1, 0]
+    assert equal(batch.cell_state(0), alone.cell_state())
+
+
 @pytest.mark.parametrize("stepper", ["rkc", "implicit"])
 def test_frames_of_a_member_are_those_of_its_single_run(stepper, device, precision):
     """Members that differ in length, in their frames' interval, and so in how many frames a look at them finds."""

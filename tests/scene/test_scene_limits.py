@@ -163,11 +163,11 @@ def test_problems_between_settings_are_told_at_once():
 
 
 def test_of_very_many_problems_the_first_are_told_and_the_rest_counted(path):
-    path.write_text("".join(f"k{i} = 1\n" for i in range(1000)))
+    path.write_text("".join(f"k{i} = 1\n" for i in range(1000)) + "[motor]\ntorque = 1e9\naxis_angle = -1\n")
     with pytest.raises(SceneError) as caught:
         load(path)
     lines = lines_of(caught)
-    assert len(lines) == 21 and lines[-1].endswith("and 980 more problems")
+    assert len(lines) == 21 and lines[-1].endswith("and 982 more problems")
 
 
 def test_a_value_of_the_group_is_at_fault_once():

@@ -30,6 +30,16 @@ def test_motors_that_stand_still_leave_equilibrium_alone(device):
     assert abs(turned(sim)).max() < 1e-9  # also when restoring lengths turns the body
 
 
+def test_members_average_over_their_own_times(device):
+    law = {**WARM, "motor.law": "torque_speed", "motor.torque": 1.26, "motor.knee": 0.0, "motor.no_load": 1500.0}
+    scenes = [cell({**law, "motor.averaging_time": time}) for time in (1e-3, 2e-5)]
+    batch, *alone = (Simulation(own, device=device) for own in (scenes, *scenes))
+    for sim in (batch, *alone):
+        sim.advance(1e-4)
+    found = [sim.system.state.optional.motor.torque.numpy() for sim in (batch, *alone)]
+    assert np.array_equal(found[0], np.concatenate(found[1:])) and not np.array_equal(found[1], found[2])
+
+
 def test_a_prescribed_rate_is_kept(precision, device):
     sim = Simulation(cell({**WARM, "motor.law": "rate", "motor.rate": 200.0}, precision), device=device)
     sim.advance(1e-3)

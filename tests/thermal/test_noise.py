@@ -11,7 +11,7 @@ from warpflag_kernels.thermal import strain_gradients
 from tests.bench import Bench
 from tests.helpers import cell, free_nodes, shaken, touching_cell
 from tests.helpers import matrix as rotation_of
-from tests.oracles import dense_mobility, drag_coefficients
+from tests.oracles import dense_mobility, drag_coefficients, rotne_prager
 from warpflag.model.geometry import InitialState
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Scene, with_values
@@ -128,6 +128,23 @@ def test_lanczos_root_of_the_pair_sum(mode, precision, device):
                 assert np.linalg.norm(v - exact @ w) < most * np.linalg.norm(v)
         products = draw.stepper.lanczos.data.products.numpy()
         assert np.all(products == 5) if tolerance is None else products.max() < lanczos_space.MOST_PRODUCTS
+
+
+def test_lanczos_root_with_a_free_end(precision, device):
+    """Of a filament without a body r_0 is a node like the others."""
+    own = {"body.enabled": False, "flagella.count": 1, "flagella.length": 1.2, "hydrodynamics.mode": "all"}
+    scene = cell({**own, "fluid.noise_tolerance": 1e-5, **WARM}, precision)
+    start = shaken(scene, 4, node=0.002)
+    (x,), radius = start.positions, pair_radius(scene)
+    pairs = rotne_prager(x, radius, scene.fluid.viscosity)
+    for i in range(len(x)):
+        pairs[i, :, i, :] = np.eye(3) / (6 * np.pi * scene.fluid.viscosity * radius)
+    draw = Draw([scene], [start], device)
+    draw.moving = np.arange(len(x))
+    for number in range(3):
+        found, z = draw.pairs(number)
+        exact = (root(pairs.reshape(3 * len(x), -1)) @ z.ravel()).reshape(-1, 3)
+        assert np.linalg.norm((found - exact)[1:]) < (1e-5 if precision == "float64" else 1e-4) * np.linalg.norm(exact)
 
 
 def test_velocities_have_the_covariance_of_the_mobility(device):

@@ -62,6 +62,14 @@ def test_the_page_has_the_record_s_frames(record):
     assert motor_rate["lines"] == [[None, *map(float, range(1, 12))]] * 3
 
 
+def test_the_view_holds_a_body_longer_than_the_flagella(tmp_path):
+    values = {"body.length": 16.0, "body.width": 0.8, "flagella.length": 2.0}
+    with made_record(tmp_path / "long", 1, scene=with_values(paper_scene("long"), values)) as record:
+        view = content_of(page_of(record))["view"]
+    along = np.array(view["axes"]) @ [0.0, 0.0, 1.0]  # of the body's axis, to the right
+    assert along == pytest.approx([1.0, 0.0, 0.0]) and view["half"][0] >= 8.0
+
+
 @pytest.mark.parametrize("name", ["phase_difference", "curvature", "steric_force"])
 def test_the_page_has_the_movie_s_colours(record, name):
     sent = content_of(page_of(record))["colorings"][name]

@@ -87,6 +87,16 @@ def test_light_comes_from_the_light():
     assert turned[100 + 30, 100].min() > turned[100 - 30, 100].max()
 
 
+def test_a_highlight_lies_where_the_surface_mirrors_the_light():
+    """Its normal halves the angle between light and eye; without gloss the brightest point faces the light."""
+    picture = drawn(((0, 0, 0), (0, 0, 1e-6), 2.0, (0.02, 0.02, 0.02)))
+    shown = picture.mean(axis=2)[70:130, 70:130]  # all of it the sphere
+    rows, columns = np.nonzero(shown >= 0.9 * shown.max())
+    halfway = LIGHT[0] + [0.0, 0.0, 1.0]
+    up = 2.0 * halfway[1] / np.linalg.norm(halfway) * 200 / 8.0
+    assert (70 + columns.mean(), 70 + rows.mean()) == pytest.approx((99.5, 99.5 - up), abs=2.0)
+
+
 def test_what_stands_in_the_light_throws_a_soft_shadow():
     body = ((-2.5, 0, 0), (2.5, 0, 0), 1.0, WHITE)
     # A thin rod in the light, out of the camera's way: it is above the picture.

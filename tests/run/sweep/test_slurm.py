@@ -39,6 +39,7 @@ def test_shares_of_a_script_cover_every_member(started, tmp_path):
 def test_members_are_cut_to_fit_the_wall_time(started, monkeypatch):
     monkeypatch.setattr(type(started), "seconds_per_member", lambda *_: 100.0)
     assert slurm.Jobs(started, 100.0).jobs() == 3
+    assert slurm.Jobs(started, 160.0).jobs() == 3  # members fill four fifths of the time at most
     assert slurm.Jobs(started, 200.0).jobs() == 2
     assert slurm.Jobs(started, 200.0, workers=2).jobs() == 1
     assert slurm.Jobs(started, 3600.0, count=9).jobs() == 3  # never more than members

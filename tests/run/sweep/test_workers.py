@@ -15,7 +15,7 @@ import pytest
 from tests.runs import assert_same_frames, small, summary
 from warpflag.run import run, sweep
 from warpflag.run.stop import Stop
-from warpflag.run.sweep import Sweep, batches, pool
+from warpflag.run.sweep import Sweep, batches, pool, worker
 from warpflag.scene import dumps
 
 
@@ -235,3 +235,24 @@ def test_workers_end_as_the_sweep_does(status, number):
         workers.end(status)
         ((_, outcomes),) = workers.finished()
     assert made[0].signals == [number] and [outcome.status for outcome in outcomes] == [status]
+
+
+def test_a_batch_costs_what_its_longest_member_takes(monkeypatch):
+    """A simulation that takes a second to begin and one for every 10 us; told per member."""
+    clock = [0.0]
+
+    class Timed:
+        def __init__(self, *_, **__):
+            self.time = 0.0
+
+        def prepare(self):
+            clock[0] += 1.0
+
+        def advance(self, until):
+            clock[0] += (until - self.time) / 1e-5
+            self.time = until
+
+    monkeypatch.setattr(worker, "Simulation", Timed)
+    monkeypatch.setattr(worker, "process_time", lambda: clock[0])
+    scenes = [small({"duration": duration}) for duration in (4e-5, 2e-4)]
+    assert worker.cost(scenes, "cpu") == pytest.approx((1.0 + 20.0) / 2)

@@ -31,7 +31,7 @@ from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.scene import Scene, loads
 
-__all__ = ["main", "prepare"]
+__all__ = ["cost", "main", "prepare"]
 
 _SECONDS_PER_REPORT = 0.2  # between two reports of the time reached: five a second
 _LEAST_SEEN = 1.0  # wall time [s] from which a worker tells how long its batch will take: the first steps are short
@@ -172,14 +172,19 @@ def _load_kernels(scene: Scene, device: str, quiet: bool) -> None:
 
 
 def _measured(request: dict[str, Any]) -> dict[str, Any]:
-    """Time per cell of its start and of stepping through the whole scene [s]."""
     scenes = [loads(text) for text in request["measure"]]
     if request["device"] not in _loaded:
         _load_kernels(scenes[0], request["device"], request["quiet"])
-    return {"seconds": _cost(scenes, request["device"])}
+    return {"seconds": cost(scenes, request["device"])}
 
 
-def _cost(scenes: list[Scene], device: str | None) -> float:
+def cost(scenes: list[Scene], device: str | None) -> float:
+    """Time per cell of a batch's start and of stepping until its longest scene ends, by a part of that [s].
+
+    Args:
+        scenes: of the cells.
+        device: to compute on; on the CPU the time is that of computing.
+    """
     clock = process_time if device == "cpu" else perf_counter  # a core is shared with what else the machine does
     began = clock()
     simulation = Simulation(scenes, device=device)
