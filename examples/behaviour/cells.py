@@ -38,6 +38,7 @@ def of_cell(path: Path) -> dict[str, np.ndarray]:
     angle, duration = np.degrees(found.tumble_angles[known]), np.diff(found.tumbles, axis=1)[known, 0]
     return {
         "angle": angle,
+        "angle, from 10 deg on": angle[angle >= 10.0],
         "angle, from 0.1 s on": angle[duration >= 0.1],
         "angle, from 0.2 s on": angle[duration >= 0.2],
         "angle, one motor": angle[motors[known] <= 1],
@@ -101,7 +102,7 @@ def draw() -> None:
     for axes, name, bins, label, published in zip(
         panels,
         ("angle", "tumble", "speed"),
-        (np.arange(0, 181, 15), np.arange(0, 1.01, 0.1), 12),
+        (np.arange(0, 181, 15), np.arange(0, values["tumble"].max(initial=0.9) + 0.1, 0.1), 12),
         ("tumble angle, degrees", "tumble, s", "speed in runs, µm/s"),
         ((68, "Berg & Brown 1972"), (0.14, "Berg & Brown 1972"), (29, "Darnton et al. 2007")),
         strict=True,
