@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.scene import dumps
 from warpflag.view.usd import Shot, movie_stage, write_movie
 from warpflag.view.usd.check import problems
+from warpflag.view.usd.read import Film
 
 
 def test_value_clips_play_as_one_file_does(tmp_path):
@@ -80,3 +84,56 @@ def test_a_movie_that_could_not_be_finished_leaves_the_old_one(tmp_path, monkeyp
     with pytest.raises(KeyboardInterrupt):
         write_movie(record, path)
     assert path.read_bytes() == before
+
+
+DAMAGE = """
+import resource
+import sys
+from pathlib import Path
+from examples.reliability.damage import damaged
+from warpflag.base.output import OutputError
+from warpflag.view.usd.check import problems_of
+from warpflag.view.usd.read import Film
+
+resource.setrlimit(resource.RLIMIT_AS, (4 * 2**30,) * 2)
+sound = Path(sys.argv[1])
+for seed in range(150):
+    path = sound.with_name(f"{seed}.usdc")  # USD keeps files by their names
+    path.write_bytes(damaged(sound.read_bytes(), seed)[1])
+    try:
+        film = Film(path)
+        film.code_at(1e-4), film.thinnest(), film.camera(film.end), film.light(film.end), film.rods(film.end)
+    except OutputError as error:
+        assert "\\n" not in str(error) and len(str(error)) < 400, str(error)
+        print("refused", end=" ")
+        if "is damaged" in str(error):
+            print("late", end=" ")
+            try:
+                problems_of(str(path))
+            except OutputError:
+                pass
+    path.unlink()
+"""
+
+
+def test_a_damaged_movie_is_drawn_or_refused_in_a_line(tmp_path):
+    """In a process of its own, which USD may crash."""
+    write_movie(made_record(tmp_path / "run", 6), tmp_path / "movie.usdc")
+    root = str(Path(__file__).parents[3])
+    command = [sys.executable, "-c", DAMAGE, str(tmp_path / "movie.usdc")]
+    ended = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": ":".join(sys.path)}, cwd=root
+    )
+    assert ended.returncode == 0, ended.stderr[-1000:]
+    assert ended.stdout.count("refused") > 20 and "late" in ended.stdout
+
+
+@pytest.mark.parametrize(("start", "end"), [(0, 1e12), (0, np.inf), (-1e12, 2), (2, 1)])
+def test_time_codes_without_frames_are_refused(tmp_path, start, end):
+    write_movie(made_record(tmp_path / "run", 3), tmp_path / "movie.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "movie.usdc"))
+    stage.SetStartTimeCode(start)
+    stage.SetEndTimeCode(end)
+    stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
+    with pytest.raises(OutputError, match=r"other\.usdc: its time codes, .* are not those of its frames"):
+        Film(tmp_path / "other.usdc")

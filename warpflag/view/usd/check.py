@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.view.usd.read import opened
+from warpflag.view.usd.read import opened, reading
 
 __all__ = ["problems", "problems_of"]
 
@@ -26,10 +26,11 @@ def problems_of(path: str) -> list[str]:
     """
     from pxr import UsdValidation
 
-    stage = opened(path)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    findings = UsdValidation.ValidationContext(validators).Validate(stage)
-    return [f"{finding.GetName()}: {finding.GetMessage()}" for finding in findings] + problems(stage)
+    with reading(path):
+        stage = opened(path)
+        findings = UsdValidation.ValidationContext(validators).Validate(stage)
+        return [f"{finding.GetName()}: {finding.GetMessage()}" for finding in findings] + problems(stage)
 
 
 def problems(stage: Any) -> list[str]:

@@ -5,6 +5,10 @@
 
 from __future__ import annotations
 
+import functools
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +19,11 @@ from numpy.typing import NDArray
 
 from warpflag.base.output import OutputError
 
-__all__ = ["Camera", "Film", "Rods", "opened"]
+__all__ = ["Camera", "Film", "Rods", "opened", "reading"]
 
 Array = NDArray[np.float64]
 
+_LONGEST_REASON = 160  # characters of what USD says of a damaged file: two lines of a terminal
 _PIECES_PER_SPAN = 4  # straight pieces per span of a cubic curve
 _T = np.linspace(0.0, 1.0, _PIECES_PER_SPAN + 1)[:, None]  # places along a span, its ends and between pieces
 # Catmull-Rom weights of the four points about a span, at these places; a linear curve has one piece.
@@ -82,6 +87,36 @@ def opened(path: str | Path) -> Any:
         raise OutputError(f"{path}: not a readable USD file") from None
 
 
+@contextmanager
+def reading(path: str | Path | None) -> Iterator[None]:
+    """Turns what USD and NumPy raise over a damaged file, which is read as values are asked for, into an OutputError.
+
+    Args:
+        path: the file; None for a stage in memory, whose errors are those of the program.
+    """
+    try:
+        yield
+    except (OutputError, MemoryError):
+        raise
+    except Exception as error:
+        if path is None:
+            raise
+        told = re.findall(r"' at line \d+ in file .*? : '(.*?)'\s*$", str(error), re.MULTILINE)
+        line = " ".join((told[0] if told else str(error)).split())
+        raise OutputError(f"{path}: is damaged: {line[:_LONGEST_REASON]}") from error
+
+
+def _of_file(method: Callable[..., Any]) -> Any:
+    """A method of a film that reads its file."""
+
+    @functools.wraps(method)
+    def read(film: Film, *values: Any) -> Any:
+        with reading(film.path):
+            return method(film, *values)
+
+    return read
+
+
 class Film:
     """The movie of a stage or of a .usd, .usda, .usdc or .usdz file.
 
@@ -89,6 +124,7 @@ class Film:
         source: the stage, or the path of the file.
 
     Attributes:
+        path: of the file; None for a stage.
         start: first time code.
         end: last time code.
         codes_per_second: time codes per second of the film.
@@ -96,14 +132,18 @@ class Film:
         facts: the movie's own customLayerData: origin, slow-down, colours.
 
     Raises:
-        OutputError: not readable, no movie of this program, or one of meshes.
+        OutputError: not readable, no movie of this program, or one of meshes; from every method: the file is damaged.
     """
 
     def __init__(self, source: Any):
+        self.path = Path(source) if isinstance(source, str | Path) else None
+        with reading(self.path):
+            self._begin(source if self.path is None else opened(self.path))
+
+    def _begin(self, stage: Any) -> None:
         from pxr import UsdGeom, UsdLux
 
-        is_file = isinstance(source, str | Path)
-        name, stage = (source, opened(source)) if is_file else ("the stage", source)
+        name = self.path or "the stage"
         prims = list(stage.Traverse())
         cameras, lights, cells = (
             [prim for prim in prims if belongs(prim)]
@@ -121,13 +161,19 @@ class Film:
         if not self._curves:
             raise OutputError(f"{name}: a movie of meshes, which is not drawn here; name the run directory")
         self.start, self.end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        samples = [cell.GetAttribute("warpflag:time").GetBracketingTimeSamples(np.finfo(float).max) for cell in cells]
+        last = max(codes[-1] if codes else -np.inf for codes in samples)
+        if not 0 <= self.start <= self.end <= last:
+            raise OutputError(f"{name}: its time codes, {self.start:g} to {self.end:g}, are not those of its frames")
         self.codes_per_second, self.frames_per_second = stage.GetTimeCodesPerSecond(), stage.GetFramesPerSecond()
         self.facts: dict[str, Any] = dict(stage.GetRootLayer().customLayerData.get("warpflag", {}))
 
+    @_of_file
     def time(self, code: float) -> float:
         """The simulated time at a time code [s]."""
         return self._cell.GetAttribute("warpflag:time").Get(code)
 
+    @_of_file
     def code_at(self, time: float) -> float:
         """The time code of a simulated time [s], or of the nearest one that the movie has."""
         return float(np.interp(time, self._times, np.arange(self.start, self.end + 1)))
@@ -136,10 +182,12 @@ class Film:
     def _times(self) -> list[float]:
         return [self.time(code) for code in np.arange(self.start, self.end + 1)]
 
+    @_of_file
     def thinnest(self) -> float:
         """The radius of the thinnest curves, which are the flagella [um]."""
         return min(0.5 * curves.GetWidthsAttr().Get()[0] for curves in self._curves)
 
+    @_of_file
     def camera(self, code: float) -> Camera:
         """The camera at a time code."""
         from pxr import UsdGeom
@@ -150,6 +198,7 @@ class Film:
         tangents = (0.5 * width / camera.focalLength, 0.5 * height / camera.focalLength)
         return Camera(eye, right, up, back, tangents, camera.focusDistance)
 
+    @_of_file
     def light(self, code: float) -> tuple[Array, float]:
         """Unit vector toward the distant light, shape [3], and half the angle under which it is seen [rad]."""
         from pxr import UsdGeom, UsdLux
@@ -158,6 +207,7 @@ class Film:
         angle = UsdLux.DistantLight(self._light).GetAngleAttr().Get(code)
         return toward / np.linalg.norm(toward), np.radians(0.5 * angle)
 
+    @_of_file
     def rods(self, code: float, least_radius: float = 0.0) -> Rods:
         """Everything to draw at a time code.
 
