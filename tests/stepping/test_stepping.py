@@ -157,16 +157,30 @@ def test_coefficients_are_those_of_a_stable_second_order_method(stages, device):
     assert growth[z < -4.0].max(initial=0.0) < 0.98
 
 
-@pytest.mark.parametrize("stepper", ["rkc", "implicit"])
-def test_captured_and_eager_runs_agree_to_the_last_bit(stepper, device, precision):
-    scene = with_values(cell(precision=precision), {"numerics.stepper": stepper})
+NOISY = {"fluid.temperature": 300.0, "numerics.time_step": 2e-6}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"numerics.stepper": "rkc"},
+        {"numerics.stepper": "implicit"},
+        {"numerics.stepper": "implicit", **NOISY},
+        {"numerics.stepper": "implicit", **NOISY, "hydrodynamics.body_flow": True},
+        {"numerics.stepper": "euler", "fluid.temperature": 300.0, "numerics.time_step": 4e-9},
+    ],
+    ids=["rkc", "implicit", "noisy", "noisy flow", "noisy euler"],
+)
+def test_captured_and_eager_runs_agree_to_the_last_bit(values, device, precision):
+    scene = touching_cell(values, precision)
     runs = []
     for capture in (True, False):
         sim = Simulation(scene, device=device, capture=capture)
-        sim.advance(3e-5)
+        for part in (0.5, 1.0):
+            sim.advance(part * 3e-5 if scene.numerics.stepper != "euler" else part * 4e-8)
         runs.append(sim.cell_state())
     assert same(*runs)
-    assert runs[0].step >= 3
+    assert runs[0].step >= 3 and runs[0].steric_force > 0.0
 
 
 @pytest.mark.parametrize("stepper", ["rkc", "euler"])
