@@ -14,8 +14,7 @@ from examples.reliability.attempt import Found, found
 from examples.reliability.malformed import malformed
 from warpflag.model.geometry import InitialState
 from warpflag.record.cell_state import CellState
-from warpflag.run.execute import SUSPECT
-from warpflag.run.growth import growth, growth_words
+from warpflag.run.growth import growth, growth_words, wanted
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.run.summary import accuracy_kept
 from warpflag.scene import Scene, SceneError, load, with_values
@@ -129,11 +128,13 @@ def asked(scene: Scene, time: float) -> float:
 def told(scene: Scene, sim: Simulation, states: list[CellState]) -> str:
     """What the run itself says of an error beyond what was asked; empty where it says nothing."""
     kept = accuracy_kept(scene, sim.checkpoint())
-    estimate, worst = ((kept[name] or 0.0) / kept["asked"] for name in ("estimate", "worst_window"))
-    if scene.numerics.time_step and estimate > BEYOND:
-        return f"fixed steps, whose estimate is {estimate:.3g} times"
-    step = 0.5 * float(sim.times[0] / sim.steps[0])
-    return growth_words(growth(scene, states, sim.first_node, "cpu", step)) if worst > SUSPECT else ""
+    if scene.numerics.time_step and (kept["estimate"] or 0.0) > BEYOND * kept["asked"]:
+        return f"fixed steps, whose estimate is {kept['estimate'] / kept['asked']:.3g} times"
+    steps, flagella = int(sim.steps[0]), len(scene.resolved_flagella())
+    if (doubtful := wanted(kept, steps, flagella, stopped=False)) is None:
+        return ""
+    step = 0.5 * float(sim.times[0]) / steps
+    return growth_words(growth(scene, states, sim.first_node, "cpu", step, followed=doubtful.within))
 
 
 def against_finer(
@@ -154,7 +155,7 @@ def against_finer(
     """
     cut_off = cut_off or CUT_OFF
     seen, seconds, end, sim = looks(scene, start, cut_off)
-    states = seen[:: LOOKS // 3][::-1]
+    states = seen[::-1]
     if end and end != "cut off" and not seen:
         return found("stopped", end, seconds=seconds)
     accuracy = scene.numerics.asked / FINER

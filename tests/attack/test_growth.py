@@ -10,7 +10,7 @@ import pytest
 
 from tests.runs import small, summary
 from warpflag.run import execute, run
-from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, PATIENCE, Growth, chosen, growth, growth_words
+from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, PATIENCE, Growth, chosen, growth, growth_words, wanted
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended
 from warpflag.scene import paper_scene, with_values
@@ -18,10 +18,12 @@ from warpflag.scene import paper_scene, with_values
 
 def test_a_run_is_followed_from_frames_spread_over_it():
     record: Any = SimpleNamespace(times=np.linspace(0.0, 4e-3, 41), frame_count=41, frame=lambda index: index)
-    assert list(chosen(record, None)) == [0, 40, 20]
-    assert list(chosen(record, 3.31e-3)) == [32, 40, 0, 20]  # the frame before the window of 0.1 ms
+    assert list(chosen(record, None, FOLLOWED, 3)) == [0, 40, 20]
+    many = list(chosen(record, 3.31e-3, FOLLOWED, 10))
+    assert many[:4] == [32, 40, 0, 20]  # first the one before the window of 0.1 ms
+    assert len(set(many)) == 10 and np.diff(sorted(many)).max() <= 9  # the rest is between
     record.times, record.frame_count = np.zeros(1), 1
-    assert list(chosen(record, 1e-3)) == [0]
+    assert list(chosen(record, 1e-3, FOLLOWED, 10)) == [0]
 
 
 def test_a_steady_motion_magnifies_little_and_an_unstable_one_is_told():
@@ -160,7 +162,7 @@ def test_what_grows_after_the_disturbance_has_relaxed_is_lively(monkeypatch):
     assert relaxing is not None and not relaxing.lively and growth_words(relaxing) == ""
 
 
-@pytest.mark.parametrize(("count", "share", "expected"), [(3, 3.0, 0), (4, 3.0, 1), (4, 1.5, 0), (3, 6.0, 3)])
+@pytest.mark.parametrize(("count", "share", "expected"), [(3, 3.0, 0), (4, 3.0, 1), (4, 1.5, 0), (3, 6.0, 5)])
 def test_a_crowd_is_followed_sooner_but_from_one_frame(count, share, expected, tmp_path, monkeypatch):
     asked = []
 
@@ -176,6 +178,20 @@ def test_a_crowd_is_followed_sooner_but_from_one_frame(count, share, expected, t
     achieved.worst_end.fill_(1.3e-4)
     started.execute(quiet=True)
     assert asked == [FOLLOWED_IN_CROWDS if expected == 1 else FOLLOWED] * expected
+
+
+@pytest.mark.parametrize(("shortest", "expected"), [(59, False), (61, True)])
+def test_a_run_whose_steps_are_as_short_as_they_may_be_is_followed_for_as_long_as_it_has_taken(
+    shortest, expected, monkeypatch
+):
+    monkeypatch.setattr("warpflag.run.growth.time", SimpleNamespace(process_time=lambda: 7.0))
+    kept = {"asked": 5e-3, "worst_window": 1e-3, "steps_at_shortest": shortest}
+    found = wanted(kept, 1000, 2, stopped=False)
+    assert (found is not None) == expected
+    if found is not None:
+        assert found.within == FOLLOWED and found.frames > 1 and found.patience == 7.0
+    stopped = wanted(kept, 1000, 2, stopped=True)
+    assert stopped is not None and stopped.patience == PATIENCE
 
 
 @pytest.mark.parametrize(("precision", "size"), [("float64", 1e-6), ("float32", 1e-4)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,23 +18,18 @@ from warpflag.base.streams import tell
 from warpflag.record import FrameRows, Record, RecordError
 from warpflag.record.reporters import versions
 from warpflag.run.faults import NumericalError
-from warpflag.run.growth import FOLLOWED, FOLLOWED_IN_CROWDS, PATIENCE, Growth, chosen, growth
+from warpflag.run.growth import Growth, chosen, growth, wanted
 from warpflag.run.member import Member, Outcome
 from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.summary import accuracy_kept
 
-__all__ = ["SUSPECT", "SUSPECT_OF_CROWDS", "Run"]
+__all__ = ["Run"]
 
 _CHECKPOINT_SECONDS = 5.0  # wall time between two checkpoints: what a killed run computes again
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
 _SECONDS_PER_COPY = 0.05  # wall time between two copies of all cells, a hundredth of that between checkpoints
 _WRITERS = 2  # threads that write files: one computes while the other waits for the disk; more wait for each other
-# Estimate of the worst window over the accuracy from which on a run is followed by disturbed copies (`growth`); windows
-# of sound zipping runs reach four.
-SUSPECT = 5.0
-# The same of more than `_FEW_FLAGELLA`, which slip past each other: it is followed from the frame before that window.
-SUSPECT_OF_CROWDS, _FEW_FLAGELLA = 2.0, 3
 
 
 class Run:
@@ -189,20 +183,18 @@ class Run:
             self._finish(cell, "stopped" if fault else "done", facts, fault)
 
     def _finish(self, cell: int, status: str, facts: Mapping[str, Any], fault: NumericalError | None) -> None:
-        """Ends a member; where its estimates are high, or a guard has stopped it, disturbed copies are followed."""
+        """Ends a member; where its estimates are doubtful, or a guard has stopped it, disturbed copies are followed."""
         member, kept = self.members[cell], facts["accuracy"]
-        worst = (kept["worst_window"] or 0.0) / kept["asked"]
-        high = worst > SUSPECT
-        crowd = worst > SUSPECT_OF_CROWDS and len(member.scene.resolved_flagella()) > _FEW_FLAGELLA
+        flagella = len(member.scene.resolved_flagella())
+        doubtful = wanted(kept, int(facts["steps"]), flagella, stopped=fault is not None)
 
         def follow(record: Record) -> Growth | None:
             # Members of a batch share the time that one run may take.
-            patience = PATIENCE - self._following
-            if not (high or crowd or fault) or patience <= 0.0:
+            if doubtful is None or (patience := doubtful.patience - self._following) <= 0.0:
                 return None
             began, device = process_time(), self.simulation.device.alias
-            followed, most = (FOLLOWED, None) if high or fault else (FOLLOWED_IN_CROWDS, 1)
-            frames = itertools.islice(chosen(record, kept["worst_window_end"], followed), most)
+            followed = doubtful.within
+            frames = chosen(record, kept["worst_window_end"], followed, doubtful.frames)
             step = 0.5 * self._copied_times()[cell] / max(int(facts["steps"]), 1)
             found = growth(member.scene, frames, record.first_node, device, step, patience, followed, self._check)
             self._following += process_time() - began

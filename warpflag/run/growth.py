@@ -11,11 +11,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from warpflag_kernels.stepping import accuracy
 
 from warpflag.model.geometry import InitialState
 from warpflag.record import Record
@@ -36,6 +37,7 @@ __all__ = [
     "chosen",
     "growth",
     "growth_words",
+    "wanted",
 ]
 
 FOLLOWED = 1.0e-4
@@ -48,6 +50,13 @@ LIVELY = 5.0
 """Growth from one look at the pair to a later one from which a motion is called lively. What a disturbance of single
 nodes does at first, while it relaxes, is no part of it. In a bundle of twenty it is 1.2 to 2.2, and 16 to 100 where
 flagella slip past each other."""
+SUSPECT = 5.0
+"""Estimate of the worst window over the accuracy from which on a run is followed; those of sound runs reach four."""
+SUSPECT_SHARE = 0.01
+"""Share of steps as short as an estimate may ask for from which on it is: filaments whip as fast as steps follow."""
+SUSPECT_OF_CROWDS, _FEW_FLAGELLA = 2.0, 3
+"""As `SUSPECT`, of more flagella than that, which slip past each other: from the frame before that window only."""
+_MOST_FRAMES = 10  # to follow a run from
 PATIENCE = 20.0
 """Computing time that may go into following a run [s]."""
 _DISTURBANCE = {"float64": 1.0e-6, "float32": 1.0e-4}  # um, above round-off and far below contact distances
@@ -96,17 +105,47 @@ class State(Protocol):
     def body_orientation(self) -> np.ndarray: ...
 
 
-def chosen(record: Record, worst_end: float | None, followed: float = FOLLOWED) -> Iterable[Frame]:
-    """Frames to follow a run from: before its worst estimates, the last, the first, and one from the middle.
+class Following(NamedTuple):
+    """How a run is to be followed."""
+
+    within: float  # for how long, from each frame [s]
+    frames: int  # how many, at most
+    patience: float  # computing time, at most [s]
+
+
+def wanted(kept: Mapping[str, Any], steps: int, flagella: int, stopped: bool) -> Following | None:
+    """How a run is to be followed; None where its estimates are not in doubt.
+
+    Args:
+        kept: what its estimates add up to, of `summary.accuracy_kept`.
+        steps: how many it has taken.
+        flagella: of the cell.
+        stopped: whether a guard has stopped it.
+    """
+    worst = (kept["worst_window"] or 0.0) / kept["asked"]
+    if stopped or worst > SUSPECT:
+        return Following(FOLLOWED, _MOST_FRAMES, PATIENCE)
+    if worst > SUSPECT_OF_CROWDS and flagella > _FEW_FLAGELLA:
+        return Following(FOLLOWED_IN_CROWDS, 1, PATIENCE)
+    if kept["steps_at_shortest"] > accuracy.UNCOUNTED_STEPS + SUSPECT_SHARE * steps:
+        # A stiff start has such steps, too: not for longer than the run has taken.
+        return Following(FOLLOWED, _MOST_FRAMES, min(PATIENCE, time.process_time()))
+    return None
+
+
+def chosen(record: Record, worst_end: float | None, followed: float, most: int) -> Iterable[Frame]:
+    """Frames to follow a run from: before its worst estimates, the last, the first, the middle one, others between.
 
     Args:
         record: of the run.
         worst_end: end of the window with its worst estimate [s]; None: there is none.
         followed: for how long [s].
+        most: how many.
     """
     last = record.frame_count - 1
     begin = np.searchsorted(record.times, (worst_end or 0.0) - followed, side="right") - 1
-    for index in dict.fromkeys((max(int(begin), 0), last, 0, last // 2)):
+    between = np.linspace(0, last, _MOST_FRAMES).astype(int)
+    for index in list(dict.fromkeys((max(int(begin), 0), last, 0, last // 2, *between.tolist())))[:most]:
         yield record.frame(index)
 
 
