@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -97,7 +98,7 @@ from warpflag.view.usd.read import Film
 
 resource.setrlimit(resource.RLIMIT_AS, (4 * 2**30,) * 2)
 sound = Path(sys.argv[1])
-for seed in range(150):
+for seed in range(100):
     path = sound.with_name(f"{seed}.usdc")  # USD keeps files by their names
     path.write_bytes(damaged(sound.read_bytes(), seed)[1])
     try:
@@ -117,10 +118,12 @@ for seed in range(150):
 
 
 def test_a_damaged_movie_is_drawn_or_refused_in_a_line(tmp_path):
-    """In a process of its own, which USD may crash."""
+    """One that another program has written anew, without a checksum; in a process of its own, which USD may crash."""
     write_movie(made_record(tmp_path / "run", 6), tmp_path / "movie.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "movie.usdc"))
+    stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
     root = str(Path(__file__).parents[3])
-    command = [sys.executable, "-c", DAMAGE, str(tmp_path / "movie.usdc")]
+    command = [sys.executable, "-c", DAMAGE, str(tmp_path / "other.usdc")]
     ended = subprocess.run(
         command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": ":".join(sys.path)}, cwd=root
     )
@@ -137,3 +140,25 @@ def test_time_codes_without_frames_are_refused(tmp_path, start, end):
     stage.GetRootLayer().Export(str(tmp_path / "other.usdc"))
     with pytest.raises(OutputError, match=r"other\.usdc: its time codes, .* are not those of its frames"):
         Film(tmp_path / "other.usdc")
+
+
+@pytest.mark.parametrize(("name", "clip_frames"), [("movie.usdc", None), ("movie.usdz", None), ("clips.usdc", 3)])
+def test_changed_bits_of_a_movie_are_found(tmp_path, name, clip_frames):
+    """Of numbers that USD would draw another picture from; as it was, and written anew by USD, the movie is read."""
+    folder = tmp_path / "movie"
+    folder.mkdir()
+    write_movie(made_record(tmp_path / "run", 6), folder / name, Shot(clip_frames=clip_frames))
+    parts = [folder / name, *sorted(folder.glob("*.clips/*.usdc"))]
+    assert len(parts) == (4 if clip_frames else 1)
+    for k, part in enumerate(parts):
+        sound = part.read_bytes()
+        for place in range(len(sound) // 8, len(sound) - 40, len(sound) // 8):
+            copy = shutil.copytree(folder, tmp_path / f"{k}-{place}")  # USD keeps files that it has read open
+            damaged = copy / part.relative_to(folder)
+            damaged.write_bytes(sound[:place] + bytes([sound[place] ^ 4]) + sound[place + 1 :])
+            with pytest.raises(OutputError, match=rf"{part.name}: is damaged: it does not agree with its checksum"):
+                Film(copy / name)
+    assert len(Film(folder / name).rods(5.0).start) > 80
+    stage = Usd.Stage.Open(str(folder / name))
+    stage.Export(str(tmp_path / "anew.usdc"))
+    assert len(Film(tmp_path / "anew.usdc").rods(5.0).start) > 80

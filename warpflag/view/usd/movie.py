@@ -33,6 +33,7 @@ from warpflag.scene import loads
 from warpflag.view.coloring import QUANTITIES
 from warpflag.view.usd.camera import Extent, add_camera, add_lights, arranged, steady_path, view_axes
 from warpflag.view.usd.cell import Cell
+from warpflag.view.usd.checksum import add_checksum
 from warpflag.view.usd.mesh_cell import MeshCell
 
 __all__ = ["Shot", "movie_stage", "write_movie"]
@@ -102,6 +103,8 @@ def write_movie(records: Record | Sequence[Record], path: str | Path, shot: Shot
     film.finish()
     with whole(path) as temporary:
         (_package if path.suffix == ".usdz" else _export)(film.stage, temporary)
+        if path.suffix == ".usdc":
+            add_checksum(temporary)
     for stale in clips.glob("*.usdc"):
         if not stale.name.startswith(token):
             stale.unlink()
@@ -192,8 +195,10 @@ class _Film:
             clip = self._declared(Sdf.Layer.CreateAnonymous(".usdc"))
             self._fill(clip, start, min(start + self.clip_frames + 1, self.frame_count))
             clip.Export(str(folder / name))
+            add_checksum(folder / name)
         manifest = f"{token}_manifest.usdc"
         self._declared(Sdf.Layer.CreateAnonymous(".usdc")).Export(str(folder / manifest))
+        add_checksum(folder / manifest)
         last = self.frame_count - 1
         for cell in self._cells:
             clips = Usd.ClipsAPI(cell.prim)

@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warpflag.base.output import OutputError
+from warpflag.view.usd.checksum import verify
 
 __all__ = ["Camera", "Film", "Rods", "opened", "reading"]
 
@@ -81,13 +82,16 @@ def opened(path: str | Path) -> Any:
     """
     from pxr import Tf, Usd
 
+    if Path(path).is_file():
+        with contextlib.suppress(OSError):  # which USD finds as well
+            verify(Path(path))
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException:
         raise OutputError(f"{path}: not a readable USD file") from None
 
 
-@contextmanager
+@contextlib.contextmanager
 def reading(path: str | Path | None) -> Iterator[None]:
     """Turns what USD and NumPy raise over a damaged file, which is read as values are asked for, into an OutputError.
 
