@@ -19,12 +19,12 @@ def drift(share: float) -> None:
     cases = (
         ("free, 6 µm", FREE, 1e-5, 1000),
         ("free, 6 µm", FREE, 1e-6, 2500),
-        ("on a body, 6 µm", {}, 1e-5, 1000),
+        ("on a body, 6 µm", {}, 1e-5, 4500),
         ("on a body, 6 µm", {}, 1e-6, 2500),
         ("on a body with its flow and a hook, 6 µm", {**FLOW, **HOOKED}, 1e-5, 1600),
     )
     for row, (name, values, step, steps) in enumerate(cases, 1):
-        _, sim = ensemble({**values, "numerics.time_step": step}, 64, first=64 * row)
+        _, sim = ensemble({**values, "numerics.time_step": step}, 64, True, 64 * row)
         way, before = np.zeros(64), None
         count = max(20, int(share * steps))
         for cells in looks(sim, 2e-4, step, count):
