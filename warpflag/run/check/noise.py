@@ -44,8 +44,8 @@ def of_noise(scene: Scene, step: float) -> list[str]:
     }[numerics.stepper]
     said = [
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
-        "joints err by up to 1 % at 1e-5 s, gaps of contacts by 5 % at 1e-6 s, driven motion in proportion to the "
-        "step: halve it and compare",
+        "joints err by up to 0.5 % at 1e-5 s and 300 K, gaps of contacts by 5 % at 1e-6 s, driven motion in "
+        "proportion to the step: halve it and compare",
         f"noise alone turns a flagellum about its hook: tip by about {tip(scene.duration):.2g} um in "
         f"{1e3 * scene.duration:g} ms, {tip(step):.1g} um in a step",
     ]
