@@ -1,6 +1,6 @@
 """Thermal equilibrium and diffusion, simulated beside their exact values: the tables of docs/thermal.md.
 
-    uv run examples/thermal/tables.py                   # all, some twenty minutes of a core
+    uv run examples/thermal/tables.py                   # all, an hour and a half of a core
     uv run examples/thermal/tables.py energies drift    # some
     uv run examples/thermal/tables.py --share 0.1       # with a tenth of the samples
 
