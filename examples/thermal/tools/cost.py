@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Any
 from unittest.mock import patch
 
+import warp as wp
 from warpflag_kernels.fluid import noise
 from warpflag_kernels.thermal import end_strains, equilibrium, mean_drift, strain_gradients, turned_forces
 
@@ -22,7 +23,7 @@ CASES = (
 
 
 def _quiet_contacts(model: Any, state: Any, s: Any, _noise: Any, _share: float, out: Any) -> None:
-    out.assign(s.law.force)
+    wp.copy(out, s.law.force)
 
 
 def cost(share: float) -> None:
