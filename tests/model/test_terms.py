@@ -149,6 +149,7 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
     loaded = set(re.findall(r"Module warpflag_kernels\.(\S+) \S+ load on", said))
     assert loaded == {
         "clock",
+        "program",
         "rkc.float64.fast.cells",
         "rkc_estimate.float64.fast",
         "reconstruction.float64.fast",
