@@ -31,7 +31,8 @@ __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 
 FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
-_LARGEST_BATCH = {"cpu": 64, "cuda": 512}  # members: what a worker that dies begins again; a GPU needs many to be full
+# Members: what a worker that dies begins again. A GPU needs many to be full; on a CPU more lie outside its caches.
+_LARGEST_BATCH = {"cpu": 16, "cuda": 512}
 _SAMPLE_CELLS = 8  # members that are timed
 _SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run, at least
 _TABLE_SHARE = 0.02  # of the time at most goes into them: those of ten thousand members take a second
