@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import warp as wp
@@ -155,6 +157,21 @@ def test_warp_has_its_own_functions_back_where_a_body_fails():
     with pytest.raises(ValueError, match="no launch"):
         program.Program(body, wp.get_device("cpu"))
     assert own == (wp.launch, wp.capture_if, wp.capture_while)
+
+
+def test_other_threads_go_on_while_one_captures():
+    sums = wp.full(2, 7, dtype=wp.int32, device="cpu")
+
+    def body() -> None:
+        other = threading.Thread(target=sums.fill_, args=(3,))
+        other.start()
+        other.join()
+        sums.zero_()
+
+    made = program.Program(body, wp.get_device("cpu"))
+    assert sums.numpy().tolist() == [3, 3]
+    made.run()
+    assert sums.numpy().tolist() == [0, 0]
 
 
 def test_what_a_program_points_to_lives_as_long_as_it_does():

@@ -12,7 +12,7 @@ from warpflag_kernels.base.precision import Precision
 
 
 @functools.cache
-def plain(path: Path) -> str:
+def without_comments(path: Path) -> str:
     """The text of a file without comments: they would enter the hash that decides whether a kernel is compiled anew."""
     lines = (re.sub(r"\s*//.*", "", line) for line in path.read_text(encoding="utf-8").splitlines())
     return "\n".join(line for line in lines if line.strip()) + "\n"
@@ -30,7 +30,7 @@ def native(module_file: str, name: str, p: Precision, **words: object) -> str:
     Raises:
         ValueError: the file does not have one of the words.
     """
-    text = plain(Path(module_file).with_name(f"{name}.cpp"))
+    text = without_comments(Path(module_file).with_name(f"{name}.cpp"))
     for word, meaning in words.items():
         text, found = re.subn(rf"\b{word}\b", lambda _match, meaning=meaning: str(meaning), text)
         if not found:
