@@ -24,7 +24,7 @@ from warpflag.stepping.stepper import DEFAULT_ACCURACY
 SIGMA = 0.04
 REACH = (CUTOFF + search.MARGIN) * SIGMA
 STEP, GAIN = 1e-5, 2 / 3  # s, and g of BDF2 at a constant step
-FINE = contact_solve.FINEST * SIGMA
+FINE = {"float64": contact_solve.FINEST * SIGMA, "float32": contact_solve.FINEST_SINGLE * SIGMA}
 
 
 def controlled(step: float) -> float:
@@ -147,7 +147,7 @@ class Listed:
     solver: np.ndarray
     columns: np.ndarray
     compliance: np.ndarray
-    tolerance: float = FINE
+    tolerance: float = FINE["float64"]
 
     @property
     def strength(self) -> float:
@@ -184,8 +184,9 @@ class Listed:
         return self.bench.increment(0.0, -way * self.jacobian.sum(axis=1)[6:].reshape(-1, 4))
 
 
-def listed(b: Bench, step: float = STEP, tolerance: float = FINE) -> Listed:
+def listed(b: Bench, step: float = STEP, tolerance: float | None = None) -> Listed:
     s, band = b.stepper, b.factorise(step, 1.3 * GAIN)
+    tolerance = tolerance or FINE[b.model.precision.name]
     s.law.gain.fill_(GAIN)
     s.law.gap_tolerance.fill_(tolerance)
     s.law.failed.zero_()

@@ -240,7 +240,7 @@ def test_tripod_stands_on_the_motor_axis_without_twist(path):
         normal = np.array([math.cos(around), math.sin(around), 0.0])
         motor_axis = math.cos(angle) * np.array([0, 0, 1.0]) + math.sin(angle) * normal
         assert abs(e1[0] @ motor_axis) < 1e-15
-        np.testing.assert_allclose(np.linalg.norm(e1, axis=1), 1.0, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(np.linalg.norm(e1, axis=1), 1.0, rtol=0, atol=1e-14)  # of 30 rotations
         assert abs(joint_strains(np.array([motor_axis, tangents(nodes)[0]]), e1[:2])[0, 2]) < 1e-14
         np.testing.assert_allclose(np.vecdot(tangents(nodes), e1[1:]), 0.0, atol=1e-14)
     assert state.body_position.tolist() == [0, 0, 0] and state.body_orientation.tolist() == [0, 0, 0, 1]

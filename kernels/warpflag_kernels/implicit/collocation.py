@@ -128,7 +128,8 @@ def kernels(p: Precision) -> SimpleNamespace:
     )
     cutoff, per_error = wp.constant(wp.float64(CUTOFF)), wp.constant(wp.float64(search.MARGIN_PER_ERROR))
     most_margin = wp.constant(wp.float64(search.MOST_MARGIN))
-    finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (contact_solve.FINEST, GAP_SHARE, GAP_GROWTH))
+    least = contact_solve.FINEST_SINGLE if p.name == "float32" else contact_solve.FINEST
+    finest, gap_share, gap_growth = (wp.constant(wp.float64(x)) for x in (least, GAP_SHARE, GAP_GROWTH))
 
     @wp.kernel(module=module)
     def begin(

@@ -34,6 +34,7 @@ from warpflag_kernels.rod import chain_chart
 NEWTON_STEPS = 4  # Newton iterations of a contact's scalar equation; what they leave enters the next residual
 CONTACT_ITERATIONS = 60  # products with W at most; crowds take some ten
 FINEST = 1.0e-6  # least tolerance of a gap [sigma]; below, the residual is round-off of the float32 flows
+FINEST_SINGLE = 1.0e-5  # the same in float32, whose sums leave residuals of up to 4e-6 sigma
 # Diagonal compliance over that of the nodes' local drag alone: elasticity and neighbours hold a node as well.
 DIAGONAL_PER_DRAG = 0.25
 DEEP = 0.75  # below this gap a solution starts from the contact's own scalar equation [sigma]

@@ -46,6 +46,9 @@ JUMP = 0.25
 # Shortest step that an error estimate asks for, in water [s]; only one that can't be solved goes below. Thinner fluids,
 # in which everything is faster, have a shorter one.
 SHORTEST_STEP = 2.0e-8
+# An estimate e above its round-off r stands for an error of e - r^2/e, at least this share of r: what fluctuates about
+# r does not shorten steps that no shorter step would improve.
+LEAST_APART = 0.1
 ROUND_OFF = {"float64": 1.0e-14, "float32": 3.0e-7}  # least error estimate [um]: round-off of a position of some um
 SMALLEST_STEP = 1.0e-13  # [s]; a step that can't be solved here ends the cell's run
 
@@ -100,7 +103,7 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
     safety = wp.constant(wp.float64(SAFETY))
     memory = wp.constant(wp.float64(FADING_STEPS if independent else FADING_TIME))
     forgotten, per_step = wp.constant(wp.float64(FORGOTTEN)), wp.constant(wp.float64(math.exp(-1.0 / FADING_STEPS)))
-    round_off = wp.constant(wp.float64(ROUND_OFF[p.name]))
+    round_off, least_apart = wp.constant(wp.float64(ROUND_OFF[p.name])), wp.constant(wp.float64(LEAST_APART))
     nearly_all = wp.constant(wp.float64(1.0 - STEP_TOLERANCE))
     jump = wp.constant(wp.float64(JUMP))
     lowering, lowest = wp.constant(wp.float64(LOWERING)), wp.constant(wp.float64(LOWEST))
@@ -147,7 +150,10 @@ def functions(p: Precision, independent: bool) -> SimpleNamespace:
                 aim *= control.lowered[c]
             if good and not jumps:
                 bound = wp.max(error, wp.max(lost, round_off))
-                level = wp.log(bound / (dt * dt * dt))
+                apart = bound
+                if error > lost and error > round_off:
+                    apart = wp.max(error - lost * lost / error, least_apart * lost)
+                level = wp.log(apart / (dt * dt * dt))
                 fading = per_step
                 kept = memory * dt
                 if wp.static(not independent):
