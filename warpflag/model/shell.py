@@ -23,7 +23,7 @@ from warpflag.scene.resistance import spheroid_mobility
 __all__ = ["BodyShell", "body_shell", "rotne_prager", "shell_mobility", "shells_of"]
 
 LARGEST_ERROR = 0.01
-"""Largest error of a drag that a fit may leave; the body of the default scene has 0.004 with 30 to 480 beads."""
+"""Largest error of a drag that a fit may leave; the default body has 4e-4 to 1.4e-3 with 30 to 240 beads."""
 _FIT_ITERATIONS = 12  # of the fit, at most: bodies of aspect 1 to 10 with 60 to 240 beads take 4 to 7
 _FIT_DIGITS = 4  # of radius and depths over the half width: the same beads on every machine
 _HEXAGONAL = math.sqrt(3) / 2  # distance of rows over that of points in a row, of points packed most evenly

@@ -75,7 +75,6 @@ UNITS = {
     POSITION: "um",
     MOTOR_ANGLE: "rad",
     BODY_POSITION: "um",
-    "observables/phase_difference": "rad",
     "observables/steric_force_density": "pN um-1",
     "observables/elastic_energy": "pN um",
     "observables/body_speed": "um s-1",

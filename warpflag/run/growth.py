@@ -53,7 +53,8 @@ flagella slip past each other."""
 SUSPECT = 5.0
 """Estimate of the worst window over the accuracy from which on a run is followed; those of sound runs reach four."""
 SUSPECT_SHARE = 0.01
-"""Share of steps as short as an estimate may ask for from which on it is: filaments whip as fast as steps follow."""
+"""A run is followed as well if at least this share of its steps has the shortest length that an estimate may ask for:
+filaments whip as fast as steps follow."""
 SUSPECT_OF_CROWDS, _FEW_FLAGELLA = 2.0, 3
 """As `SUSPECT`, of more flagella than that, which slip past each other: from the frame before that window only."""
 _MOST_FRAMES = 10  # to follow a run from

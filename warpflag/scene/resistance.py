@@ -29,7 +29,7 @@ __all__ = [
 _WATER = 1.0e-3  # pN s/um^2, the viscosity that the paper's drag coefficients belong to
 _PRINTED = (1.6e-3, 2.8e-3, 1.26e-6)  # gamma_par, gamma_perp [pN s/um^2] and gamma_R [pN s] of the paper
 _ZETA_3 = 1.2020569031595942  # sum of 1/n^3 over n = 1, 2, ...
-_NEARLY_ONE = 1 - 1e-9  # share of the least pair radius that is enough: it may have been chosen by equality
+_NEARLY_ONE = 1 - 1e-9  # round-off: a pair radius so close to the least allowed one is taken, it may be chosen equal
 _BOLTZMANN = 1.380649e-5  # pN um/K, exact
 
 

@@ -72,7 +72,7 @@ def struct(p: Precision) -> Any:
         ratio: wp.array(dtype=wp.float64)  # w
         theta: wp.array(dtype=wp.float64)  # collocation point as a fraction of the step
         ahead: wp.array(dtype=wp.float64)  # theta w, scale of the extrapolation by the last increment
-        reach: wp.array(dtype=wp.float64)  # rho
+        rho: wp.array(dtype=wp.float64)  # the correction e at the collocation point over that at the end of the step
         curvature: wp.array(dtype=wp.float64)  # factor of the second difference of earlier increments in predicted e
         ratio_before: wp.array(dtype=wp.float64)  # w of the last step
         one: wp.array(dtype=wp.float64)  # 1, the scale of a retraction by a whole increment
@@ -94,7 +94,7 @@ def allocate(model: DeviceModel) -> Any:
     """Arrays of the struct `Implicit`, zero but for `one`."""
     p, device = model.precision, model.device
     i = struct(p)()
-    floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "reach")
+    floats = ("over_implicit", "last_step", "step_before", "ratio", "ratio_before", "theta", "ahead", "rho")
     for name in (*floats, "curvature", "error", "share", "share_after", "begun", "awaited"):
         setattr(i, name, wp.zeros(model.cell_count, dtype=wp.float64, device=device))
     for name in ("history", "accepted", "evaluations"):
@@ -164,7 +164,7 @@ def kernels(p: Precision) -> SimpleNamespace:
         imp.ratio[c] = w
         imp.theta[c] = theta
         imp.ahead[c] = theta * w
-        imp.reach[c] = rho
+        imp.rho[c] = rho
         imp.curvature[c] = wp.float64(0.0)
         imp.ratio_before[c] = wp.float64(0.0)
         if imp.history[c] == 2:
@@ -247,7 +247,7 @@ def kernels(p: Precision) -> SimpleNamespace:
             return
         w = real(imp.ratio[c])
         ahead = real(imp.ahead[c])
-        whole = real(wp.float64(1.0) / imp.reach[c])
+        whole = real(wp.float64(1.0) / imp.rho[c])
         predictor_error = real(0.0)
         along = real(0.0)
         squared = real(0.0)

@@ -8,8 +8,9 @@ product every few steps, applied to a vector, the probe, that is kept in between
 
 kappa is taken to be the growth of the probe's length. The product is not symmetric, so that may exceed the eigenvalue;
 it tells of modes that two iterations would magnify at first. One or two flexible flagella need little more than the
-least w and are measured rarely; a probe that lags behind would grow too much then. There kappa is the Rayleigh quotient
-of the probe x in the inner product with H, in which both sides are symmetric: with the forces f = -H x,
+least w and are measured rarely; between two measurements the cell changes, and the growth of an outdated probe exceeds
+kappa. There kappa is the Rayleigh quotient of the probe x in the inner product with H, in which both sides are
+symmetric: with the forces f = -H x,
 
     kappa = w (x.H x/dt + g f.M f) / (x.H x/dt + w g f.D f),
 

@@ -5,7 +5,8 @@ Joint i couples segments i and i + 1 with tangents t, u and strain h Omega = (w1
     E = (1/2h) [A (w1 - w1^0)^2 + A (w2 - w2^0)^2 + C (w3 - w3^0)^2],     stretch: (K h / 2) (|s|/h - 1)^2
 
 (the paper's Kirchhoff density; its stretching term has no rest length as printed, here it has one). The motor
-joint 0 is a universal joint: no bending rigidity, no intrinsic twist, `hook_rigidity` in place of C. Directors follow
+joint 0 is a universal joint: no bending rigidity (that of a hook is `motor/hook.py`), no intrinsic twist,
+`hook_rigidity` in place of C. Directors follow
 a moving tangent by the minimal rotation, so gradients are taken with respect to segment vectors and spin angles.
 
 The bearing of the universal joint hands the torque -m x dE/ds_0 to the body, the part of the joint's torque across the

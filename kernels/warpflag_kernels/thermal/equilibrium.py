@@ -3,9 +3,10 @@
     (1/dt + theta M H) x = M [F + (2 theta - 1)^1/2 f] + v,
 
 F the forces at the start of the step, H = J^T k J and f of `strain_gradients`, v the thermal velocities of `noise`. A
-mode of rate lambda, z = lambda dt, is left with the variance kT/k times [2 z + (2 theta - 1) z^2]/[2 z + (2 theta - 1)
-z^2] = 1: with v alone a step of backward Euler would freeze stiff modes to 1/(1 + z/2). What is not linear errs by O(kT
-dt), and motion that is driven by O(dt). Contacts obey the exact law at the end of the step, as in `collocation`.
+mode of rate lambda, z = lambda dt, keeps the variance kT/k at any z: the noise puts in 2 z + (2 theta - 1) z^2, in
+units of kT/k (1 + theta z)^-2, and that is what the step damps. With v alone a step of backward Euler would freeze
+stiff modes to 1/(1 + z/2). What is not linear errs by O(kT dt), and motion that is driven by O(dt). Contacts obey the
+exact law at the end of the step, as in `collocation`.
 
 The step is fixed: one that depended on the noise drawn would prefer some realisations of it to others.
 """

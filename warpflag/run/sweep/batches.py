@@ -15,7 +15,7 @@ from warpflag.scene import Scene
 
 __all__ = ["Batch", "cut", "groups", "share"]
 
-_GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0  # golden ratio: its multiples modulo 1 lie most evenly
+_INVERSE_GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 lie most evenly
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,13 @@ def cut(group: Sequence[int], size: int) -> list[list[int]]:
     """A group in batches of at most so many members, as equal as they can be.
 
     Members along an axis take more and more time, or every second takes more, so that neighbours go to different
-    batches: in the order of the multiples of the golden ratio modulo 1, a stretch holds members from everywhere.
+    batches: in the order of the multiples of the inverse golden ratio modulo 1, a stretch holds members from
+    everywhere.
     """
     count = math.ceil(len(group) / size)
     if size == 1:
         return [[k] for k in group]
-    order = sorted(range(len(group)), key=lambda i: i * _GOLDEN_RATIO % 1.0)
+    order = sorted(range(len(group)), key=lambda i: i * _INVERSE_GOLDEN_RATIO % 1.0)
     ends = [len(group) * k // count for k in range(count + 1)]
     return [sorted(group[i] for i in order[first:last]) for first, last in itertools.pairwise(ends)]
 
