@@ -17,6 +17,7 @@ from warpflag import __version__, sweep_command, tradeoff_command, view_command
 from warpflag.base.exit_status import BAD_INPUT, DONE, FAILED, INTERRUPTED, STOPPED, TERMINATED
 from warpflag.base.output import machine_error
 from warpflag.base.streams import explained_cache, protected_streams, tell
+from warpflag.base.threads import keep_to_one_thread
 
 if TYPE_CHECKING:
     from warpflag.run.run import Outcome, Run
@@ -41,6 +42,7 @@ class _Parser(argparse.ArgumentParser):
 
 def command() -> int:
     """The process of the command line: `main`, with a quick start and end; returns its exit status."""
+    keep_to_one_thread()
     gc.set_threshold(_OBJECTS_PER_LOOK)
     status = main()
     gc.freeze()  # or Python looks for garbage among all that Warp has defined, a fifth of a second

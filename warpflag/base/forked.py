@@ -18,10 +18,10 @@ import sys
 import threading
 from typing import IO, Any
 
-__all__ = ["ONE_THREAD", "Forked", "Starter"]
+from warpflag.base.threads import ONE_THREAD
 
-# A worker is one process of one thread; the libraries below NumPy would start one per core in each.
-ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+__all__ = ["Forked", "Starter"]
+
 _SIGNALS = [
     getattr(signal, name)
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
-from warpflag.base.forked import ONE_THREAD, Forked, Starter
+from warpflag.base.forked import Forked, Starter
+from warpflag.base.threads import ONE_THREAD
 from warpflag.run.member import Outcome
 from warpflag.run.stop import Stop
 from warpflag.run.sweep.batches import Batch
