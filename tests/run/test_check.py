@@ -192,6 +192,9 @@ def test_the_time_is_a_range_of_its_parts():
     said = report(small(), "cpu")
     assert "# time " in said and "frames, record and movie" in said and "# What it leaves out" in said
     assert "Reynolds number" in said
+    # Of 0.08 ms: the whole has two digits.
+    found = re.search(r"stepping (\S+) s \((\S+) ms per simulated ms", said)
+    assert found is not None and float(found[2]) == pytest.approx(1e3 * float(found[1]) / 0.08, rel=0.06)
 
 
 REVERSING = {"motor.switching": "markov", "motor.to_reverse": 1e4}  # within any run

@@ -301,14 +301,16 @@ def test_crossings_are_those_of_dense_sampling(looked_at, device, precision):
 
 
 @pytest.mark.parametrize("listed_at", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("way", [0.02, 0.9])
-def test_crossings_are_seen_wherever_the_lists_were_built(way, listed_at, device, precision):
-    """Two filaments across each other, one of which moves through the other from beyond the reach of the lists, too."""
+@pytest.mark.parametrize(("h", "above", "below"), [(0.2, 0.01, 0.01), (0.2, 0.45, 0.45), (0.05, 0.005, 0.195)])
+def test_crossings_are_seen_wherever_the_lists_were_built(h, above, below, listed_at, device, precision):
+    """Two filaments across each other, one of which moves through the other from beyond the reach of the lists, too,
+    or on by many of its short segments."""
+    lengths = {"flagella.length": 2 * h, "flagella.segment_length": h}
     for aside, expected in ((0.0, True), (0.6, False)):
-        sim = Simulation(cell({"flagella.length": 0.4, "numerics.stepper": "implicit"}, precision), device=device)
-        along = 0.2 * (np.arange(3.0) - 0.6)[:, None]
+        sim = Simulation(cell({**lengths, "numerics.stepper": "implicit"}, precision), device=device)
+        along = h * (np.arange(3.0) - 0.6)[:, None]
         still, moving = along * [1.0, 0.0, 0.0], along * [0.1, 1.0, 0.0] + [aside, 0.0, 0.0]
-        before, after = (np.array([[still, np.add(moving, [0.0, 0.0, z])]]) for z in (way / 2, -way / 2))
+        before, after = (np.array([[still, np.add(moving, [0.0, 0.0, z])]]) for z in (above, -below))
         place(sim, before + listed_at * (after - before))
         neighbours.refresh(sim.system.model, sim.system.state)
         assert seen(sim, before, after, None)[0] == expected

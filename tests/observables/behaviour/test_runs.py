@@ -110,6 +110,14 @@ def test_what_is_too_short_is_no_piece_of_its_own():
     assert len(runs_and_tumbles(*path(brief), smoothing=0.01, shortest_tumble=0.06).tumbles) == 0
 
 
+def test_a_short_piece_that_an_end_of_the_path_cuts_off_stays():
+    """It may be longer than it looks, at either end."""
+    cut_off = path([(0.03, 25.0, 0), (0.15, 0.0, 40), (0.6, 25.0, 0), (0.15, 0.0, 40), (0.03, 25.0, 0)])
+    found = runs_and_tumbles(*cut_off, smoothing=0.01)
+    np.testing.assert_allclose(found.runs, [[0.0, 0.03], [0.18, 0.78], [0.93, 0.96]], atol=EDGE)
+    np.testing.assert_allclose(found.tumbles, [[0.03, 0.18], [0.78, 0.93]], atol=EDGE)
+
+
 def test_a_cell_that_only_runs_and_one_that_only_tumbles():
     found = runs_and_tumbles(*path([(1.0, 25.0, 0)]))
     assert (len(found.runs), len(found.tumbles), found.tumbling_fraction) == (1, 0, 0.0)
