@@ -13,8 +13,8 @@ from warpflag.cli import main
 from warpflag.model.geometry import initial_state
 from warpflag.run.run_directory import RunError
 from warpflag.run.simulation import Simulation
-from warpflag.run.tradeoff import Study, choices, compared, points, windows
-from warpflag.scene import with_values
+from warpflag.run.tradeoff import Study, choices, compared, points, report, windows
+from warpflag.scene import dumps, with_values
 
 SCENE = {"duration": 8e-4, "frames": 8, "flagella.length": 3.0}
 MEASURED = ("accuracy 0.07", "accuracy 0.0005", "pairs float32", "h 0.3", "h 0.1")
@@ -72,6 +72,21 @@ def test_nonsense_is_refused_before_anything_is_made(tmp_path, capsys):
     (tmp_path / "scene.toml").write_text('name = "wrong"\n[motor]\ntorque = "much"\n')
     assert main(["tradeoff", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "made")]) == 2
     assert "motor.torque" in capsys.readouterr().err and not (tmp_path / "made").exists()
+
+
+def test_the_course_is_that_of_the_record_which_is_named(tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(dumps(small(SCENE)))
+    given = [str(tmp_path / "scene.toml"), "-o", str(tmp_path / "made"), "--record", str(tmp_path / "none")]
+    assert main(["tradeoff", *given, "--budget", "1"]) == 2
+    assert "none: no such record" in capsys.readouterr().err
+
+
+def test_a_mean_is_known_to_a_per_cent_after_as_many_parts_as_its_spread_asks_for():
+    """Parts of 2 ms that differ by 5 % of their mean: the mean of 25 of them has an error of 1 %."""
+    rates = {"body_speed": (-100.0, 5.0), "body_rate": (-100.0, 0.9), "motor_rate": (0.0, 1.0)}
+    said = report.text([], [], windows.Course([], 1e-3, 48e-3, rates, 2e-3))
+    assert "body_speed: -100, parts of 2 ms differ by 5: 50 ms" in said
+    assert "differ by 0.9: one part will do" in said and "differ by 1: unknown" in said
 
 
 def test_a_mesh_that_was_stopped_is_no_reference():

@@ -8,6 +8,9 @@ import warp as wp
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.stepping import step_control
 
+from tests.helpers import cell
+from warpflag.run.simulation import Simulation
+
 RATE, LEVEL = 5.0, 1.0e11  # um/s, um/s^3: steps of some 6 us
 TIME = 4.0e-3  # s
 
@@ -65,3 +68,15 @@ def test_the_sum_of_fluctuating_errors_is_what_was_asked(spread, jumps, device, 
 def test_steady_errors_are_aimed_at_below_what_was_asked(device, precision):
     share, lowered = stepped(0.1, 0.0, precision, device)
     assert share == pytest.approx(step_control.SAFETY, rel=0.05) and lowered == 1.0
+
+
+def test_a_restored_run_goes_on_with_the_rate_that_it_aimed_at(device, precision):
+    """A hundredth of the rate takes steps a tenth as long."""
+    sim = Simulation(cell({}, precision), device=device)
+    sim.advance(2e-5)
+    held, taken = sim.checkpoint(), []
+    for lowered in (1.0, 0.01):
+        sim.restore({**held, "stepper.lowered": np.full_like(held["stepper.lowered"], lowered)})
+        sim.advance(5e-5)
+        taken.append(sim.steps[0] - held["control.steps"][0])
+    assert taken[1] > 2.5 * taken[0]
