@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from warpflag_kernels.base.plan import Flows, Switches
+from warpflag_kernels.motor.laws import Law
 
 from warpflag.model.switching import corners, second_intervals
 from warpflag.record.cell_state import Evaluation
@@ -76,8 +77,9 @@ def _fill_motor_law(scenes: Sequence[Scene], precision: Any, device: Any, data: 
         tables.append(corners(scene, k))
     device_array = functools.partial(wp.array, device=device)
     m, real = parts.motor_law, precision.real
+    kinds = [Law.PRESCRIBED if spec.law == "rate" else Law.STRAIGHT for _, _, spec in specs]
+    m.kind = device_array(np.array(kinds), dtype=wp.int32)
     m.curve = device_array(np.array(curves), dtype=precision.vec3)
-    m.prescribed = device_array(np.array([spec.law == "rate" for _, _, spec in specs], dtype=np.int32), dtype=wp.int32)
     m.rate = device_array(np.array([2 * math.pi * spec.rate for _, _, spec in specs]), dtype=real)
     first = np.concatenate([[0], np.cumsum([len(times) for times, _ in tables])])
     m.first_switch = device_array(first, dtype=wp.int32)

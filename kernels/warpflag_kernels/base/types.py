@@ -52,9 +52,9 @@ def structs(p: Precision) -> SimpleNamespace:
     class MotorLaw:
         """Where the torque is not constant, see motor/laws.py; per flagellum [K] unless said otherwise."""
 
-        curve: wp.array(dtype=vec3)  # [2 K], forward and reverse: plateau [pN um], knee [rad/s], slope [pN um s]
-        prescribed: wp.array(dtype=wp.int32)  # 1: the rate is prescribed, not the torque
-        rate: wp.array(dtype=real)  # that rate, relative to the body [rad/s]
+        kind: wp.array(dtype=wp.int32)  # which law it is, by the numbers of motor/laws.py
+        curve: wp.array(dtype=vec3)  # [2 K], torque against rate, forward and reverse: the three numbers of that law
+        rate: wp.array(dtype=real)  # prescribed, relative to the body [rad/s]
         first_switch: wp.array(dtype=wp.int32)  # [K + 1], flagellum k has the corners from first_switch[k] on
         switch_time: wp.array(dtype=wp.float64)  # [corners], time of a corner [s]
         switch_drive: wp.array(dtype=real)  # [corners], drive there, from 1 (forward) to -1 (reverse)

@@ -76,7 +76,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
     drive_at, settled = law.drive_at, law.settled
     body_rate, inverse6 = body_coupling.functions(p, shell).body_rate, body_coupling.functions(p, shell).inverse6
     follow = block_band.functions(p).follow
-    most = wp.constant(laws.MOTOR_ITERATIONS)
+    most, prescribed = wp.constant(laws.MOTOR_ITERATIONS), wp.constant(wp.int32(laws.Law.PRESCRIBED))
     one, zero = wp.constant(real(1.0)), wp.constant(real(0.0))
     module = p.module("motor_solve", "_".join([*["averaged"] * averaged, *["shell"] * shell]))
 
@@ -99,7 +99,7 @@ def _kernels(p: Precision, averaged: bool, shell: bool) -> SimpleNamespace:
         """`settled` of motor k, by its average rate if the law asks for that."""
         share = one
         known = zero
-        if model.motor_law[0].prescribed[k] == 0:
+        if model.motor_law[0].kind[k] != prescribed:
             share = share_of(band, motors, c)
             known = (one - share) * motors.average[k]
         torque, softness, slope = settled(model, k, drive, share * mobility, share * passive_rate + known)

@@ -21,6 +21,7 @@ Within an implicit step the torque is a number, `State.motor.within_step`, which
 """
 
 import functools
+from enum import IntEnum
 from types import SimpleNamespace
 
 import warp as wp
@@ -35,6 +36,17 @@ from warpflag_kernels.fluid import body
 MOTOR_ITERATIONS = 8
 
 
+class Law(IntEnum):
+    """Kinds of laws. `MotorLaw.curve` holds three numbers in each sense.
+
+    STRAIGHT: torque up to the knee [pN um], knee [rad/s], slope above it [pN um s].
+    PRESCRIBED: none of them; the rate is given.
+    """
+
+    STRAIGHT = 0
+    PRESCRIBED = 1
+
+
 @functools.cache
 def curves(p: Precision) -> SimpleNamespace:
     """Device functions of the law of one motor: its drive at a time, its curve, and what it settles to."""
@@ -43,6 +55,7 @@ def curves(p: Precision) -> SimpleNamespace:
     module = p.module("motor_curves")
     zero = wp.constant(real(0.0))
     one = wp.constant(real(1.0))
+    prescribed = wp.constant(wp.int32(Law.PRESCRIBED))
 
     @wp.func(module=module)
     def drive_at(model: Model, k: wp.int32, time: wp.float64):
@@ -90,7 +103,7 @@ def curves(p: Precision) -> SimpleNamespace:
             the torque [pN um]; how much it falls with the passive rate [pN um s]; and the slope of the piece of the
             curve that the motor is on [pN um s], -1 for a prescribed rate.
         """
-        if model.motor_law[0].prescribed[k] != 0:
+        if model.motor_law[0].kind[k] == prescribed:
             return (drive * model.motor_law[0].rate[k] - passive_rate) / mobility, one / mobility, -one
         turns, curve = sense(model, k, drive)
         own = turns * passive_rate

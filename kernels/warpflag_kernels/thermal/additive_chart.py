@@ -22,6 +22,7 @@ from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body as body_stage
 from warpflag_kernels.fluid import noise as noise_stage
+from warpflag_kernels.motor import laws
 from warpflag_kernels.rod import chain_chart, rotations
 from warpflag_kernels.rod import comoving_chart as chart_stage
 from warpflag_kernels.rod.comoving_chart import vec6d
@@ -67,7 +68,7 @@ def _kernels(p: Precision, free: bool, motor_law: bool) -> SimpleNamespace:
     f, fd = rotations.functions(p), rotations.functions(p.double)
     transport, turn, perpendicular_unit = f.transport, f.turn, f.perpendicular_unit
     attached, body_axis, rotation_vector_quatd = f.attached, f.body_axis, fd.rotation_vector_quat
-    respond = body_stage.mobility(p).respond
+    respond, prescribed = body_stage.mobility(p).respond, wp.constant(wp.int32(laws.Law.PRESCRIBED))
     module = p.module("additive_chart", "free" * free + "motor_law" * motor_law)
 
     @wp.kernel(module=module)
@@ -302,7 +303,7 @@ def _kernels(p: Precision, free: bool, motor_law: bool) -> SimpleNamespace:
             state.pose.body_axis[c] = body_axis(orientation)
         spin = x.node[e][3]
         carried = transport(chart.base.director[e], chart.base.tangent[e], t)
-        if wp.static(motor_law) and e == first and model.motor_law[0].prescribed[k] != 0:
+        if wp.static(motor_law) and e == first and model.motor_law[0].kind[k] == prescribed:
             # The tripod keeps to its rate against the body as it has turned in the end.
             turned = orientation * wp.quat_inverse(chart.base.body_orientation[c])
             carried = vec3(wp.quat_rotate(turned, wp.vec3d(chart.base.director[e])))
