@@ -17,18 +17,7 @@ from warpflag.base.above import method_from
 from warpflag.scene import attachment
 from warpflag.scene.errors import Problems, SceneError
 from warpflag.scene.run_sections import Numerics, Start
-from warpflag.scene.sections import (
-    Body,
-    External,
-    Flagella,
-    FlagellumOverride,
-    Fluid,
-    Hook,
-    Hydrodynamics,
-    Motor,
-    Polymorphs,
-    Steric,
-)
+from warpflag.scene.sections import Flagella, FlagellumOverride, Sections
 from warpflag.scene.settings import Section, integer, number, switch, text
 from warpflag.scene.smooth_helix import TAPER
 
@@ -80,7 +69,7 @@ class FlagellumSpec:
 
 
 @dataclass(frozen=True)
-class Scene(Section, key=""):
+class Scene(Sections, Section, key=""):
     """Everything that a run depends on.
 
     Sections are attributes of the same names as in a scene file; `flagellum` holds either nothing or
@@ -96,16 +85,7 @@ class Scene(Section, key=""):
     duration: float = number(0.015, "s", 1e-12, 10, "simulated time")
     frames: int = integer(300, 1, 10_000_000, "recorded intervals; frames + 1 values are kept")
     behaviour: bool = switch(False, "runs and tumbles, bundles, wrapping, wobble and motor loads in the summary")
-    flagella: Flagella = dataclasses.field(default_factory=Flagella)
     flagellum: tuple[FlagellumOverride, ...] = ()
-    motor: Motor = dataclasses.field(default_factory=Motor)
-    hook: Hook = dataclasses.field(default_factory=Hook)
-    polymorphs: Polymorphs = dataclasses.field(default_factory=Polymorphs)
-    fluid: Fluid = dataclasses.field(default_factory=Fluid)
-    hydrodynamics: Hydrodynamics = dataclasses.field(default_factory=Hydrodynamics)
-    steric: Steric = dataclasses.field(default_factory=Steric)
-    body: Body = dataclasses.field(default_factory=Body)
-    external: External = dataclasses.field(default_factory=External)
     numerics: Numerics = dataclasses.field(default_factory=Numerics)
     start: Start = dataclasses.field(default_factory=Start)
     format: int = integer(1, 1, 1, "which defaults the file has; without it those of the paper's model")

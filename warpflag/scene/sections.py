@@ -12,7 +12,7 @@ Body axes: e_b3 is the long axis and points to the rear, e_b1 is where azimuths 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from warpflag.scene.settings import Section, choice, integer, number, numbers, switch, vector
 from warpflag.scene.smooth_helix import inscribed_strain, smooth_strain
@@ -330,3 +330,18 @@ class External(Section, key="external"):
     body_force: tuple[float, float, float] = vector(
         (0.0, 0.0, 0.0), "pN", -1e4, 1e4, "force on the body, at its centre"
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sections:
+    """The sections above as attributes of a scene, in the order of a scene file; a new one is added here alone."""
+
+    flagella: Flagella = field(default_factory=Flagella)
+    motor: Motor = field(default_factory=Motor)
+    hook: Hook = field(default_factory=Hook)
+    polymorphs: Polymorphs = field(default_factory=Polymorphs)
+    fluid: Fluid = field(default_factory=Fluid)
+    hydrodynamics: Hydrodynamics = field(default_factory=Hydrodynamics)
+    steric: Steric = field(default_factory=Steric)
+    body: Body = field(default_factory=Body)
+    external: External = field(default_factory=External)
