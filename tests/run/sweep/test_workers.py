@@ -61,6 +61,16 @@ def until_idle(workers: pool.Pool, count: int) -> list:
     return found + ended
 
 
+def test_members_that_one_simulation_can_advance_are_of_one_group(tmp_path):
+    """Those that differ in precision, stepper or terms, or that have begun, are of others."""
+    values = [{}, {"motor.torque": 1.0}, {"numerics.precision": "float32"}, {"numerics.stepper": "rkc"}]
+    scenes = [small(own) for own in (*values, {"steric.enabled": False}, {})]
+    directories = [tmp_path / str(k) for k in range(6)]
+    directories[5].mkdir()
+    (directories[5] / "scene.toml").write_text(dumps(scenes[5]))
+    assert batches.groups(scenes, directories, range(6)) == [[0, 1], [2], [3], [4], [5]]
+
+
 def test_the_batch_that_ends_last_is_handed_back_where_it_is_worth_it():
     made: list[Scripted] = []
 
