@@ -95,6 +95,30 @@ def test_members_resume_from_different_frames(tmp_path):
         assert_same_frames(alone(scene, tmp_path / scene.name), directory)
 
 
+def test_a_batch_in_parts_is_ended_and_resumed_as_one(tmp_path, monkeypatch):
+    """On a CPU a large batch is advanced in parts: one is through, one amid its way and one not begun at the signal."""
+    monkeypatch.setattr(execute, "LARGEST_ON_CPU", 2)
+    scenes = [*members(), small({"name": "e"})]
+    made = directories(tmp_path / "batch", 5)
+    batch = run.start_batch(scenes, made, "cpu", strict=True, checkpoint_seconds=0.0, movies=False)
+    seen = []
+
+    def watch(reached: float) -> None:
+        seen.append(reached)
+        if reached > sum(scene.duration for scene in scenes[:1]) + 6e-5:
+            signal.raise_signal(signal.SIGTERM)
+
+    with frame_by_frame():
+        outcomes = batch.execute_all(quiet=True, watch=watch)
+    assert [outcome.status for outcome in outcomes] == ["done", *["terminated"] * 4]
+    assert (np.diff(seen) >= 0).all()
+    assert run.begun_at_checkpoint(made[1]) and not run.begun_at_checkpoint(made[4])
+    resumed = run.resume_batch(made, device="cpu", strict=True, movies=False)
+    assert [outcome.status for outcome in resumed.execute_all(quiet=True)] == ["done"] * 5
+    for scene, directory in zip(scenes, made, strict=True):
+        assert_same_frames(alone(scene, tmp_path / scene.name), directory)
+
+
 def test_a_member_resumes_by_itself(tmp_path):
     scenes, made = members()[:2], directories(tmp_path / "batch", 2)
     batch = run.start_batch(scenes, made, "cpu", checkpoint_seconds=0.0)

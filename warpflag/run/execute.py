@@ -1,17 +1,22 @@
-"""What advances runs: one loop from frame to frame over the cells of a simulation, a run directory each."""
+"""What advances runs: one loop from frame to frame over the cells of a simulation, a run directory each.
+
+A batch too large for the caches of a CPU is advanced in parts, each with a simulation of its own, one after the other.
+"""
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, process_time
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from warpflag_kernels.stepping.health import Fault
 
+from warpflag.base.device import find_device
 from warpflag.base.output import sync_file_systems
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
@@ -24,7 +29,12 @@ from warpflag.run.simulation import Simulation
 from warpflag.run.stop import Ended, Stop
 from warpflag.run.summary import accuracy_kept
 
-__all__ = ["Run"]
+__all__ = ["LARGEST_ON_CPU", "Run", "RunInParts", "in_parts", "parts"]
+
+LARGEST_ON_CPU = 16
+"""Cells that a CPU advances together: the states of more do not fit into a core's caches, and a step of each takes up
+to a third more; fewer share less of what begins and ends a batch (docs/sweeps.md)."""
+_T = TypeVar("_T")
 
 _CHECKPOINT_SECONDS = 5.0  # wall time between two checkpoints: what a killed run computes again
 _CHECKPOINT_SHARE = 0.05  # of the wall time at most goes into checkpoints
@@ -63,6 +73,13 @@ class Run:
         """What advances the cells."""
         assert self._simulation is not None
         return self._simulation
+
+    def notes(self) -> list[tuple[str, str]]:
+        """What is to be told of the starts of members: name of the scene and a sentence each."""
+        if self._simulation is None:
+            return []
+        own = zip(self.members, self.simulation.notes, strict=True)
+        return [(member.scene.name, note) for member, notes in own for note in notes]
 
     def execute(self, quiet: bool = False, stop: Stop | None = None) -> Outcome:
         """Runs a single scene to its end, or until a guard or a signal stops it; see `execute_all`."""
@@ -103,9 +120,8 @@ class Run:
                 watch(reached)
             stop.check()
 
-        for member, notes in zip(self.members, self.simulation.notes, strict=True):
-            for note in () if quiet else notes:
-                tell(f"{member.scene.name}: {note}")
+        for name, note in () if quiet else self.notes():
+            tell(f"{name}: {note}")
         self._check = stop.check
         try:
             stop.check()
@@ -296,3 +312,67 @@ class Run:
             "kernel_flags": simulation.system.model.precision.cpu_flags if simulation.device.is_cpu else "",
             "versions": versions(),
         }
+
+
+def parts(batch: Sequence[_T], device: str | None) -> list[list[_T]]:
+    """A batch in parts that are advanced together, as equal as they can be and in order; on a GPU it is one.
+
+    Args:
+        batch: scenes, or whatever there is one of per cell.
+        device: "cpu", "cuda:0", ...; None: the preferred one.
+    """
+    count = max(math.ceil(len(batch) / LARGEST_ON_CPU), 1) if find_device(device).is_cpu else 1
+    ends = [len(batch) * k // count for k in range(count + 1)]
+    return [list(batch[first:last]) for first, last in itertools.pairwise(ends)]
+
+
+class RunInParts(Run):
+    """Runs of cells that are advanced one after the other, seen from outside as one.
+
+    Args:
+        runs: of the parts.
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        super().__init__(None, [member for run in runs for member in run.members])
+        self._runs, self._at_work = list(runs), runs[0]
+
+    @property
+    def simulation(self) -> Simulation:
+        """What advances the part that is at work."""
+        return self._at_work.simulation
+
+    def execute_all(
+        self,
+        quiet: bool = False,
+        stop: Stop | None = None,
+        watch: Callable[[float], None] | None = None,
+    ) -> list[Outcome]:
+        """As of a `Run`; once a signal has come, the parts that have not begun are resumable from their scenes."""
+        if stop is None:
+            with Stop() as own:
+                return self.execute_all(quiet, own, watch)
+        progress = Progress(sum(member.scene.duration for member in self.members), quiet=quiet)
+        outcomes: list[Outcome] = []
+        behind = 0.0  # simulated time of the parts that are through [s]
+        try:
+            for run in self._runs:
+                self._at_work = run
+
+                def look(reached: float, behind: float = behind) -> None:
+                    progress.update(behind + reached)
+                    if watch is not None:
+                        watch(behind + reached)
+
+                for name, note in () if quiet else run.notes():
+                    tell(f"{name}: {note}")
+                outcomes += run.execute_all(quiet=True, stop=stop, watch=look)
+                behind += sum(member.scene.duration for member in run.members)
+        finally:
+            progress.close()
+        return outcomes
+
+
+def in_parts(runs: Sequence[Run]) -> Run:
+    """One run of those of the parts of a batch."""
+    return runs[0] if len(runs) == 1 else RunInParts(runs)

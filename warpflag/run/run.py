@@ -6,6 +6,7 @@ checkpoint with the numbers of a run that was never stopped.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from warpflag.model.start import shape_of_frame
 from warpflag.record import RECORD_NAME, Record, RecordError
 from warpflag.run import checkpoint
 from warpflag.run.carried_values import check_frame
-from warpflag.run.execute import Run
+from warpflag.run.execute import Run, in_parts, parts
 from warpflag.run.lock import Lock
 from warpflag.run.member import Member, Outcome
 from warpflag.run.run_directory import (
@@ -70,7 +71,7 @@ def start_batch(
     strict: bool = False,
     **options: Any,
 ) -> Run:
-    """New runs of scenes that one simulation advances together.
+    """New runs of scenes that are advanced together, on a CPU in `parts`.
 
     Args:
         scenes: all with the same precision, stepper and switches.
@@ -82,9 +83,9 @@ def start_batch(
     Raises:
         As `start`.
     """
-    simulation = Simulation(scenes, device=device, strict=strict)
+    simulations = [Simulation(part, device=device, strict=strict) for part in parts(scenes, device)]
     locks: list[Lock] = []
-    members = []
+    members: list[Member] = []
     try:
         for scene, path in zip(scenes, directories, strict=True):
             directory, lock = claim_directory(scene.name, str(path))
@@ -95,7 +96,8 @@ def start_batch(
         for lock in locks:
             lock.release()
         raise
-    return Run(simulation, members, **options)
+    of_each = zip(simulations, parts(members, device), strict=True)
+    return in_parts([Run(simulation, own, **options) for simulation, own in of_each])
 
 
 def resume(directory: str, overrides: Sequence[str] = (), device: str | None = None, **options: Any) -> Run:
@@ -125,13 +127,15 @@ def resume_batch(
     strict: bool = False,
     **options: Any,
 ) -> Run:
-    """Runs that one simulation advances together, each from its own last checkpoint on; see `resume`.
+    """Runs that are advanced together, on a CPU in `parts`, each from its own last checkpoint on; see `resume`.
 
-    All are taken up at a checkpoint, or all start again: where some have none, those have to be resumed by themselves.
+    Those that have no checkpoint start again.
     """
     locks: list[Lock] = []
     try:
-        return _resumed([Path(directory) for directory in directories], overrides, device, strict, options, locks)
+        stretches = [list(own) for _, own in itertools.groupby(map(Path, directories), begun_at_checkpoint)]
+        cut = [part for stretch in stretches for part in parts(stretch, device)]
+        return in_parts([_resumed(part, overrides, device, strict, options, locks) for part in cut])
     except BaseException:
         for lock in locks:
             lock.release()
@@ -146,23 +150,24 @@ def _resumed(
     options: dict[str, Any],
     locks: list[Lock],
 ) -> Run:
-    scenes, metas, parts, origins = [], [], [], []
+    """Runs of one part of a batch: all of them are at a checkpoint, or none; their locks are added to `locks`."""
+    scenes, metas, states, origins, own = [], [], [], [], []
     for path in paths:
         if not (path / SCENE_NAME).is_file():
             raise RunError(f"--resume {path}: holds no run, there is no {SCENE_NAME}")
-        locks.append(Lock(path))
+        own.append(Lock(path))
+        locks.append(own[-1])
         scenes.append(_prolonged(recorded_scene(path, bool(overrides)), overrides))
     if len(paths) == 1 and _is_done(paths[0], scenes[0]):
-        return Run(None, [_done_already(paths[0], scenes[0], locks[0])])
-    begun = [begun_at_checkpoint(path) for path in paths]
-    if not any(begun):
+        return Run(None, [_done_already(paths[0], scenes[0], own[0])])
+    if not begun_at_checkpoint(paths[0]):
         for path in paths:
             (path / RECORD_NAME).unlink(missing_ok=True)  # frames without a checkpoint: they are computed again
         simulation = Simulation(scenes, device=device, strict=strict)
-    elif all(begun):
+    else:
         for path, scene in zip(paths, scenes, strict=True):
             arrays, meta = _checkpoint(path, scene)
-            parts.append(arrays)
+            states.append(arrays)
             metas.append(meta)
             with Record(path) as record:
                 origins.append(shape_of_frame(record.frame(0), record.first_node))
@@ -172,14 +177,12 @@ def _resumed(
                     raise _not_sound(path, error) from None
         simulation = Simulation(scenes, starts=origins, device=device or metas[0]["device"], strict=strict)
         try:
-            names = parts[0].keys()
-            simulation.restore({name: np.concatenate([part[name] for part in parts]) for name in names})
+            names = states[0].keys()
+            simulation.restore({name: np.concatenate([state[name] for state in states]) for name in names})
         except (KeyError, ValueError) as error:
             raise _not_sound(paths[0], error) from None
-    else:
-        raise RunError(f"--resume {paths[0]}: some runs of the batch have a checkpoint and some have none")
     members = []
-    for k, (path, scene, lock) in enumerate(zip(paths, scenes, locks, strict=True)):
+    for k, (path, scene, lock) in enumerate(zip(paths, scenes, own, strict=True)):
         members.append(Member(path, scene, lock, metas[k] if metas else None, alone=len(paths) == 1))
         write_whole(path / SCENE_NAME, members[-1].text)
     return Run(simulation, members, **options)

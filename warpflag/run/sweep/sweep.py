@@ -16,6 +16,7 @@ from warpflag.base.output import text_of_file
 from warpflag.base.progress import Progress
 from warpflag.base.streams import tell
 from warpflag.model.starts import Starts
+from warpflag.run.execute import LARGEST_ON_CPU
 from warpflag.run.lock import SWEEP_NAME, Lock, LockedError
 from warpflag.run.member import Outcome
 from warpflag.run.run_directory import RunError, check_same_scene, claim_directory, write_whole
@@ -32,7 +33,7 @@ __all__ = ["FINISHED", "SweepRun", "resume", "resume_or_start", "start"]
 FINISHED = ("done", "stopped")
 """Statuses of members that are not run again."""
 # Members: what a worker that dies begins again. A GPU needs many to be full; on a CPU more lie outside its caches.
-_LARGEST_BATCH = {"cpu": 16, "cuda": 512}
+_LARGEST_BATCH = {"cpu": LARGEST_ON_CPU, "cuda": 512}
 _SAMPLE_CELLS = 8  # members that are timed
 _SECONDS_PER_TABLE = 10.0  # between two writings of the tables while members run, at least
 _TABLE_SHARE = 0.02  # of the time at most goes into them: those of ten thousand members take a second
