@@ -225,8 +225,9 @@ def test_a_sweep_from_the_command_line(scene, capsys):
     assert cli.main(["sweep", scene, *arguments]) == 0
     assert [load(f"out/000{k}/scene.toml").motor.torque for k in range(2)] == [1.0, 3.0]
     assert cli.main(["sweep", "--resume", "out", "--quiet"]) == 0
-    assert cli.main(["sweep", "--quiet", "--set", "frames=1", "--grid", "motor.torque=2,", scene]) == 0
-    assert load("runs/small/0000/scene.toml").motor.torque == 2
+    assert not list(Path("out").glob("*/movie.usdc"))
+    assert cli.main(["sweep", "--quiet", "--movies", "--set", "frames=1", "--grid", "motor.torque=2,", scene]) == 0
+    assert load("runs/small/0000/scene.toml").motor.torque == 2 and Path("runs/small/0000/movie.usdc").is_file()
     line = refused(capsys, "sweep", scene, *arguments)
     assert "--resume out" in line
     assert cli.main(["sweep", scene, *arguments, "--resume-or-start"]) == 0

@@ -123,6 +123,12 @@ def test_curvature_of_a_circle_and_of_the_ground_state():
     np.testing.assert_allclose(curvature(nodes[None], np.array([0, 15])), 1.3 / np.cos(0.21), rtol=1e-9)
 
 
+def test_curvature_at_a_joint_of_unequal_segments():
+    """2 tan(angle/2), 2 at a right angle, over the mean length; the ends take their neighbour's."""
+    bent, first_node = rods([[0, 0, 0], [0.1, 0, 0], [0.1, 0.3, 0], [0.1, 0.3, 0.5]])
+    np.testing.assert_allclose(curvature(bent, first_node), [[2 / 0.2, 2 / 0.2, 2 / 0.4, 2 / 0.4]], rtol=1e-12)
+
+
 def test_phase_difference_is_with_the_nearest_flagellum(tmp_path):
     with made_record(tmp_path, 1) as record:  # flagella of 30, 20 and 30 segments
         positions, directors, first_node = record.positions[:], record.directors[:], record.first_node
