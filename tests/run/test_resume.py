@@ -285,11 +285,11 @@ def test_a_multiple_of_the_frame_interval_that_rounds_down_is_one(tmp_path):
 @pytest.mark.parametrize(
     "override, words",
     [
-        ("motor.torque=2", "no other change than duration; start.record goes on"),
-        ("duration=4e-5", "where the run stands"),
-        ("duration=8.5e-5", "multiple of the frame interval"),
+        ("motor.torque=2", "--set: motor.torque = 2: .* no other change than duration; start.record goes on"),
+        ("duration=4e-5", "--resume .*: duration = 4e-05: .* where the run stands"),
+        ("duration=8.5e-5", "--set: duration = 8.5e-05: must be a multiple of the frame interval"),
         ("duration=8.05e-5", "multiple of the frame interval"),
-        ("duration=-1", "must be a number"),
+        ("duration=-1", "--set: duration = -1: must be a number"),
         ("duration", "key=value"),
     ],
 )
