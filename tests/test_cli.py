@@ -12,7 +12,7 @@ import pytest
 
 from warpflag import cli
 from warpflag.record import Record
-from warpflag.scene import load
+from warpflag.scene import dumps, load
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SMALL = """
@@ -218,6 +218,28 @@ def test_resuming_a_finished_run_says_so(scene, capsys):
     assert cli.main(["run", scene, "-o", "made", "--quiet"]) == 0
     assert cli.main(["run", "--resume", "made"]) == 0
     assert "done already" in capsys.readouterr().out
+
+
+def test_limits_reach_a_run_however_it_begins(scene, monkeypatch):
+    from warpflag.run import run
+
+    taken = []
+
+    def beginning(how):
+        def begin(*_arguments, **options):
+            taken.append((how, options["checkpoint_seconds"]))
+            raise KeyboardInterrupt
+
+        return begin
+
+    for how in ("start", "resume"):
+        monkeypatch.setattr(run, how, beginning(how))
+    for given in ([scene], ["--resume", "made"], [scene, "-o", "made", "--resume-or-start"]):
+        assert cli.main(["run", *given, "--checkpoint-interval", "1:30"]) == 130
+    Path("made").mkdir()
+    Path("made/scene.toml").write_text(dumps(load(scene)))
+    assert cli.main(["run", scene, "-o", "made", "--resume-or-start", "--checkpoint-interval", "7"]) == 130
+    assert taken == [("start", 90.0), ("resume", 90.0), ("start", 90.0), ("resume", 7.0)]
 
 
 def test_a_sweep_from_the_command_line(scene, capsys):

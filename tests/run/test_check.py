@@ -87,7 +87,11 @@ def test_noise_turns_a_filament_as_rotational_diffusion_does():
     assert of_noise(small(), 1e-6) == []
     assert "miss contacts" in of_noise(scene, 5e-6)[-1]
     assert len(of_noise(with_values(scene, {"steric.enabled": False}), 5e-6)) == 2
-    # A hook that resists bending holds it: <x^2> = 2 kT/k L^2; a free one lets it point anywhere: 2 L^2.
+    # A hook that resists bending does not matter for long before drag/(2 k), 3 ms here.
+    soon = of_noise(with_values(scene, {"hook.stiffness": 4.0, "duration": 1e-4}), 1e-6)[1]
+    found = re.search(r"tip by about ([\d.]+) um in 0\.1 ms", soon)
+    assert found is not None and float(found[1]) == pytest.approx(tip * math.sqrt(0.1), rel=0.05)
+    # It holds it: <x^2> = 2 kT/k L^2; a free one lets it point anywhere: 2 L^2.
     for stiffness, far in ((4.0, math.sqrt(2 * energy / 4.0) * 3.0), (0.0, math.sqrt(2) * 3.0)):
         longest = with_values(scene, {"hook.stiffness": stiffness, "duration": 10.0})
         found = re.search(r"tip by about ([\d.]+) um", of_noise(longest, 1e-6)[1])
