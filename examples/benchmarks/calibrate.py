@@ -129,6 +129,12 @@ CONSTANTS = {
     "step_control.JUMP": Constant("stepping.step_control", (0.25, 0.13, 0.5, 1.1), UPSET),
     "step_control.SHORTEST_STEP": Constant("stepping.step_control", (2e-8, 1e-9, 2e-7, 1e-6), UPSET),
     "step_control.LARGEST_GROWTH": Constant("stepping.step_control", (2.0, 1.3, 1.6, 2.4, 3.0), UPSET),
+    "step_control.LEAST_APART": Constant(
+        "stepping.step_control",
+        (0.1, 0.01, 0.25, 1.0),
+        ("free", "contact"),
+        (("stepper", "rkc"), ("accuracy", 1e-3), *SINGLE),
+    ),
     "stability.LEAST_OVER_IMPLICIT": Constant("implicit.stability", (1.3, 1.0, 1.1, 1.2, 1.5, 2.0), TWO),
     "stability.OVER_IMPLICIT_PER_KAPPA": Constant("implicit.stability", (0.6, 0.4, 0.5, 0.55, 0.7, 1.0), ("crowd",)),
     "stability.LARGEST_FALL": Constant("implicit.stability", (0.985, 0.5, 0.9, 0.97, 1.0), ("crowd",)),
@@ -141,6 +147,7 @@ CONSTANTS = {
     "contact_solve.DEEPEST": Constant("implicit.contact_solve", (0.9, 0.7, 0.8, 1.0, 1.1), CONTACT_LAW),
     "contact_solve.CONTACT_ITERATIONS": Constant("implicit.contact_solve", (60, 5, 10, 20, 120), CONTACT_LAW),
     "contact_solve.FINEST": Constant("implicit.contact_solve", (1e-6, 1e-9, 1e-4, 1e-3), CONTACT_LAW),
+    "contact_solve.FINEST_SINGLE": Constant("implicit.contact_solve", (1e-5, 1e-6, 1e-4, 1e-3), CONTACT_LAW, SINGLE),
     "contact_solve.NEWTON_STEPS": Constant("implicit.contact_solve", (4, 1, 2, 3, 6), CONTACT_LAW),
     "quasi_newton.SECANTS_KEPT": Constant(
         "implicit.quasi_newton",

@@ -33,6 +33,7 @@ COUNTS = {
     "damage": 300,
     "malformed": 500,
     "random": 300,
+    "living": 200,
     "extremes": extremes.COUNT,
 }
 BAD = ("wrong", "lost", "traceback")
@@ -72,6 +73,7 @@ class Attack:
             "damage": lambda: runs.damage(self.base, seed, scratch),
             "malformed": lambda: scenes.malformed_scene(seed, scratch),
             "random": lambda: scenes.random_scene(seed, scratch),
+            "living": lambda: scenes.random_scene(seed, scratch, living=True),
             "extremes": lambda: extremes.extreme(scattered(number, COUNTS["extremes"]), scratch),
         }
         begin = time.monotonic()

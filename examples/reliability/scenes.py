@@ -90,6 +90,61 @@ def random_values(seed: int) -> dict[str, Any]:
     return {key: value for key, value in drawn.items() if value is not None or key == "flagella.phase_difference"}
 
 
+def living_values(seed: int) -> dict[str, Any]:
+    """Those of `random_values` with terms beyond the paper: hooks, flow round the body, motors on curves or at given
+    rates that reverse, filaments that change form, contact of a flagellum with itself, free filaments."""
+    chance = random.Random(f"living scene {seed}")
+    values = random_values(seed)
+    duration = values["duration"]
+
+    def maybe(share: float, value: Any) -> Any:
+        return value if chance.random() < share else None
+
+    def spread(usual: float, factor: float) -> float:
+        return usual * factor ** chance.uniform(-1, 1)
+
+    if chance.random() < 0.08:  # no body, and nothing that belongs to one
+        kept = ("flagella.", "fluid.", "numerics.", "steric.")
+        values = {key: value for key, value in values.items() if key.startswith(kept)}
+        values |= {"flagella.count": 1, "body.enabled": False, "duration": duration, "frames": 10}
+        values["external.force_per_length"] = tuple(chance.uniform(-0.5, 0.5) for _ in range(3))
+        return values
+    mode = chance.choice(["none", "within", "all", "consistent", "consistent", "consistent"])
+    knee = chance.uniform(20, 250)
+    drawn: dict[str, Any] = {
+        "hydrodynamics.mode": mode,
+        "hydrodynamics.body_flow": chance.random() < 0.5 if mode in ("all", "consistent") else None,
+        "flagella.nodes_on_helix": maybe(0.2, True),
+        "flagella.on_axis": maybe(0.2, True),
+        "steric.self_contact": maybe(0.25, True),
+        "hook.length": maybe(0.6, chance.uniform(0.02, 0.12)),
+        "hook.stiffness": maybe(0.6, spread(0.65, 6)),
+        "hook.stiffening_torque": maybe(0.2, spread(1.0, 3)),
+        "motor.law": chance.choice(["constant", "torque_speed", "torque_speed", "rate"]),
+        "motor.knee": knee,
+        "motor.no_load": knee + spread(100, 3),
+        "motor.reverse_torque": maybe(0.3, spread(1.0, 3)),
+        "motor.rate": chance.choice([-1, 1]) * spread(120, 3),
+        "motor.switching": chance.choice(["none", "none", "schedule", "markov"]),
+        "motor.switch_times": tuple(sorted(duration * chance.random() for _ in range(chance.randint(1, 3)))),
+        "motor.switch_ramp": max(duration * chance.uniform(0.02, 0.3), 1e-6),
+        "motor.to_reverse": chance.uniform(0.5, 3) / duration,
+        "motor.to_forward": chance.uniform(0.5, 3) / duration,
+        "motor.coupling": maybe(0.2, chance.random()),
+        "motor.seed": chance.randrange(1000),
+        "polymorphs.enabled": maybe(0.35, True),
+        "polymorphs.target": chance.choice(["semicoiled", "curly_1", "coiled"]),
+        "polymorphs.front_speed": spread(300, 4),
+        "external.force_per_length": maybe(0.15, tuple(chance.uniform(-0.3, 0.3) for _ in range(3))),
+    }
+    if drawn["motor.switching"] != "schedule":
+        drawn["motor.switch_times"] = None
+    values |= {key: value for key, value in drawn.items() if value is not None}
+    for k in range(values["flagella.count"] if chance.random() < 0.5 else 0):
+        values[f"flagellum.{k}.anchor_offset"] = chance.uniform(-0.4, 1.0) * values.get("body.length", 2.5) / 2
+    return values
+
+
 def looks(
     scene: Scene, start: InitialState | None, cut_off: float
 ) -> tuple[list[CellState], float, str, Simulation | None]:
@@ -183,10 +238,17 @@ def against_finer(
     return found("told" if words else "wrong", f"{said}; {words}", **numbers)
 
 
-def random_scene(seed: int, folder: Path) -> Found:
-    """A random valid scene against a run of a thirtieth of its accuracy."""
+def random_scene(seed: int, folder: Path, living: bool = False) -> Found:
+    """A random valid scene against a run of a thirtieth of its accuracy.
+
+    Args:
+        seed: of the scene.
+        folder: not used.
+        living: whether it has terms beyond the paper.
+    """
     try:
-        scene = with_values(Scene(name=f"random {seed}"), random_values(seed))
+        values = living_values(seed) if living else random_values(seed)
+        scene = with_values(Scene(name=f"random {seed}"), values)
         return against_finer(scene)
     except SceneError as error:
         return found("refused", str(error))
