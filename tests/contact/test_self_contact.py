@@ -241,3 +241,14 @@ def test_the_recorded_force_is_that_of_the_shape(tmp_path, device):
     load = contact_load(frames, shape[1], 0.8, SIGMA, np.array(spacing))
     np.testing.assert_allclose(load.sum(axis=1), 2 * 2.0 * recorded_force, rtol=1e-6)
     assert not contact_load(frames, shape[1], 0.8, SIGMA).any()
+
+
+def test_density_leaves_out_segments_within_three_diameters_of_contour():
+    """Along the sides of a square, sigma 1.2 of them, the fourth segment after one is the first that touches it."""
+    nodes = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 0.6], [1, 0, 0.6]])
+
+    def density(x: np.ndarray) -> float:
+        return contact.steric_force_density(x, np.array([0, len(x)]), 0.8, 0.06, 1.0, self_contact=True)
+
+    assert density(nodes[:5]) == 0.0
+    assert density(nodes) == pytest.approx(float(contact.steric_force(0.03, 0.8, 0.06)))

@@ -246,9 +246,17 @@ def test_tripod_stands_on_the_motor_axis_without_twist(path):
     assert state.body_position.tolist() == [0, 0, 0] and state.body_orientation.tolist() == [0, 0, 0, 1]
 
 
-def test_a_motor_axis_against_the_first_segment_is_refused():
-    scene = with_values(opened(0.0, intrinsic_curvature=(0, 0, 0)), {"motor.axis_angle": 180.0})
-    with pytest.raises(SceneError, match=r"motor\.axis_angle = 180\.0: .* flagellum 0"):
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"motor.axis_angle": 180.0}, r"motor\.axis_angle = 180\.0: .* flagellum 0"),
+        ({"flagellum.1.motor_axis_angle": 180.0}, r"flagellum\.1\.motor_axis_angle = 180\.0: .* flagellum 1"),
+        ({"motor.axis_angle": 180.0, "flagellum.0.motor_axis_angle": 0.0}, r"^motor\.axis_angle = .* flagellum 1"),
+    ],
+)
+def test_a_motor_axis_against_the_first_segment_is_refused(values, words):
+    scene = with_values(opened(0.0, intrinsic_curvature=(0, 0, 0)), values)
+    with pytest.raises(SceneError, match=words):
         initial_state(scene)
 
 

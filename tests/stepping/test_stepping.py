@@ -50,6 +50,19 @@ def largest_difference(a: CellState, b: CellState) -> float:
     return max(float(np.abs(getattr(a, name) - getattr(b, name)).max()) for name in STATE)
 
 
+@pytest.mark.parametrize(("stepper", "step"), [("rkc", 1e-7), ("euler", 2e-9)])
+def test_fixed_steps_are_equal(stepper, step, device, precision):
+    """Two and a half of them are three that are shorter, to the last bit."""
+    scene, until = cell({}, precision), 2.5 * step
+    found = []
+    for own in (step, until / 3):
+        sim = Simulation(stepped(scene, stepper, own), device=device)
+        sim.advance(until)
+        assert sim.steps[0] == 3
+        found.append(sim.cell_state())
+    assert same(*found)
+
+
 @pytest.mark.parametrize("make", [cell, touching_cell], ids=["free", "contact"])
 def test_rkc_is_second_order_against_euler(make, device):
     scene, window = make(), 4e-5
