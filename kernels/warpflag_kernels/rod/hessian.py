@@ -169,21 +169,21 @@ def _kernels(p: Precision) -> SimpleNamespace:
         e = wp.cross(vec3(b[3], b[4], b[5]), state.pose.tangent[i])
         if i > model.first_node[k]:
             e = here - displacement(model, state.pose.position, x, i - 1, k)
+        if i + 1 < model.first_node[k + 1]:
+            f = displacement(model, state.pose.position, x, i + 1, k) - here
+            first = x.node[i][3]
+            second = x.node[i + 1][3]
+            ge = stiffness.ee[i] * e + wp.transpose(stiffness.fe[i]) * f
+            state.joint_before[i] = ge + first * stiffness.e_first[i] + second * stiffness.e_second[i]
+            gf = stiffness.fe[i] * e + stiffness.ff[i] * f
+            state.joint_after[i] = gf + first * stiffness.f_first[i] + second * stiffness.f_second[i]
+            spins = stiffness.spins[i]
+            turn_first = wp.dot(stiffness.e_first[i], e) + wp.dot(stiffness.f_first[i], f)
+            turn_second = wp.dot(stiffness.e_second[i], e) + wp.dot(stiffness.f_second[i], f)
+            state.joint_spin_before[i] = turn_first + spins[0] * first + spins[1] * second
+            state.joint_spin_after[i] = turn_second + spins[1] * first + spins[2] * second
+        if i > model.first_node[k]:
             state.stretch_change[i] = stiffness.stretch[i] * e
-        if i + 1 == model.first_node[k + 1]:
-            return
-        f = displacement(model, state.pose.position, x, i + 1, k) - here
-        first = x.node[i][3]
-        second = x.node[i + 1][3]
-        ge = stiffness.ee[i] * e + wp.transpose(stiffness.fe[i]) * f
-        gf = stiffness.fe[i] * e + stiffness.ff[i] * f
-        state.joint_before[i] = ge + first * stiffness.e_first[i] + second * stiffness.e_second[i]
-        state.joint_after[i] = gf + first * stiffness.f_first[i] + second * stiffness.f_second[i]
-        spins = stiffness.spins[i]
-        turn_first = wp.dot(stiffness.e_first[i], e) + wp.dot(stiffness.f_first[i], f)
-        turn_second = wp.dot(stiffness.e_second[i], e) + wp.dot(stiffness.f_second[i], f)
-        state.joint_spin_before[i] = turn_first + spins[0] * first + spins[1] * second
-        state.joint_spin_after[i] = turn_second + spins[1] * first + spins[2] * second
 
     return SimpleNamespace(joints=joints, joint_changes=joint_changes)
 
