@@ -131,6 +131,13 @@ def test_a_setting_that_a_later_version_adds_leaves_runs_resumable():
     assert settings_sha256(scene, set_later, later_default) != settings_sha256(scene)
 
 
+def test_what_leaves_the_motion_alone_is_no_part_of_a_checkpoint_s_scene():
+    scene = small({"motor.torque": 1.0})
+    for values in ({"duration": 1.0}, {"frames": 99}, {"behaviour": True}):
+        assert settings_sha256(with_values(scene, values)) == settings_sha256(scene)
+    assert settings_sha256(with_values(scene, {"motor.torque": 1.1})) != settings_sha256(scene)
+
+
 def test_the_record_of_another_run_is_refused(tmp_path):
     directory, other = halved(tmp_path / "made"), halved(tmp_path / "other", {"motor.torque": 1.0})
     shutil.copy(other / "run.h5", directory)

@@ -168,3 +168,8 @@ def test_which_runs_and_tumbles_of_a_path_end():
     assert found.run_ended.tolist() == [True, True] and found.tumble_ended.tolist() == [True, False]
     mean, error = found.run_length
     assert mean == pytest.approx(0.9, abs=EDGE) and error == pytest.approx(mean / np.sqrt(2))
+
+
+def test_the_speed_in_runs_is_the_mean_over_their_time():
+    found = runs_and_tumbles(*path([(1.6, 15.0, 0), (0.2, 0.0, 60), (0.4, 25.0, 0)]))
+    assert found.run_speed == pytest.approx((1.6 * 15 + 0.4 * 25) / 2.0, rel=0.03)
