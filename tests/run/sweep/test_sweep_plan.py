@@ -222,6 +222,9 @@ def test_a_logarithmic_axis_has_equal_ratios(folder):
     np.testing.assert_allclose(found, [1e-3, 2e-3, 4e-3, 8e-3], rtol=1e-12)
     assert (found[0], found[-1]) == (1e-3, 8e-3)
     assert grid_axes(["fluid.viscosity=1e-3:8e-3:4:log"]) == {"fluid.viscosity": found}
+    for low in (0.0, -1e-3):
+        with pytest.raises(SceneError, match=r"axes\.fluid\.viscosity = .* must have from and to above 0"):
+            members(folder, text.replace("1e-3", str(low)))
     linear = "[axes]\nfluid.viscosity = { from = 1e-3, to = 8e-3, count = 2, spacing = 'linear' }\n"
     assert [member.scene.fluid.viscosity for member in members(folder, linear)] == [1e-3, 8e-3]
 
