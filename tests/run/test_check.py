@@ -196,6 +196,9 @@ def test_the_time_is_a_range_of_its_parts():
     said = report(small(), "cpu")
     assert "# time " in said and "frames, record and movie" in said and "# What it leaves out" in said
     assert "Reynolds number" in said
+    # Per frame: time, step, 22 nodes with director, two motors with rate, place and turn of the body, six observables.
+    size = re.search(r"record (\S+) MiB", said)
+    assert size is not None and float(size[1]) == pytest.approx(9 * (2 + 22 * 6 + 4 + 7 + 6) * 8 / 2**20, rel=0.05)
     # Of 0.08 ms: the whole has two digits.
     found = re.search(r"stepping (\S+) s \((\S+) ms per simulated ms", said)
     assert found is not None and float(found[2]) == pytest.approx(1e3 * float(found[1]) / 0.08, rel=0.06)

@@ -316,6 +316,21 @@ def test_crossings_are_seen_wherever_the_lists_were_built(h, above, below, liste
         assert seen(sim, before, after, None)[0] == expected
 
 
+@pytest.mark.parametrize(("turn", "expected"), [(2.1, True), (-2.1, True), (1.9, False), (-1.9, False)])
+def test_a_motor_that_turns_too_far_in_a_step_is_named(turn, expected, device, precision):
+    sim = Simulation(cell({}, precision), device=device)
+    sim.evaluate()
+    s, first = sim.system, int(sim.first_node[1])
+    increments = np.zeros((s.model.element_count, 4))
+    increments[first, 3] = turn
+    s.chart.increment.assign(increments)
+    for flags in (s.chart.commit, s.chart.at_start, s.state.data.active):
+        flags.fill_(1)
+    health.check(s.model, s.state, s.chart, s.guard, s.control)
+    code = int(s.control.fault.numpy()[0])
+    assert code == (health.encode(Fault.TURN) + first if expected else NO_FAULT)
+
+
 @pytest.mark.parametrize(("apart", "kind"), [(0.0, Fault.CROSSING), (1e-3, Fault.CROSSING), (4e-3, None), (0.03, None)])
 @pytest.mark.parametrize("stepper", ["rkc", "implicit"])
 def test_a_start_whose_flagella_touch_is_refused(apart, kind, stepper, device, precision):

@@ -30,6 +30,20 @@ def test_motors_that_stand_still_leave_equilibrium_alone(device):
     assert abs(turned(sim)).max() < 1e-9  # also when restoring lengths turns the body
 
 
+def test_a_curve_sees_the_rate_averaged_over_its_time(precision, device):
+    """tau dA/dt = Omega - A, implicitly: steps as long as tau count one half, those before them a quarter."""
+    law = {**WARM, "motor.law": "torque_speed", "motor.torque": 1.26, "motor.averaging_time": 1e-5}
+    sim = Simulation(cell(law, precision), device=device)
+    angles, expected = [np.zeros(2)], np.zeros(2)
+    for i in range(3):
+        sim.advance(1e-5 * (i + 1))
+        angles.append(turned(sim)[0])
+        expected = 0.5 * (angles[-1] - angles[-2]) / 1e-5 + 0.5 * expected
+        found = sim.checkpoint()["stepper.average_rate"]
+        np.testing.assert_allclose(found, expected, rtol=1e-2)  # the axis moves within a step, 0.1 % here
+    assert sim.steps[0] == 3
+
+
 def test_members_average_over_their_own_times(device):
     law = {**WARM, "motor.law": "torque_speed", "motor.torque": 1.26, "motor.knee": 0.0, "motor.no_load": 1500.0}
     scenes = [cell({**law, "motor.averaging_time": time}) for time in (1e-3, 2e-5)]

@@ -46,6 +46,13 @@ def grid(tmp_path):
     )
 
 
+def test_a_map_shows_the_means_of_the_repeats(tmp_path):
+    rows = [f"{2 * k + i},{k},{i},{k // 2},{k % 2},done,{10 * k + 4 * i}" for k in range(4) for i in range(2)]
+    made = sweep(tmp_path / "made", {"motor.torque": [0, 1], "flagella.tilt": [0, 1]}, rows, "rates.net_speed")
+    drawn = sweep_figures.maps(sweep_figures.read(made)).axes[0].images[0].get_array()
+    np.testing.assert_array_equal(drawn, [[2, 22], [12, 32]])
+
+
 def test_curves_show_means_and_standard_errors_of_the_repeats(line):
     figure = sweep_figures.curves(sweep_figures.read(line))
     speed, zipped = figure.axes

@@ -50,7 +50,7 @@ def test_the_sweep_file_of_the_documentation_is_sound(tmp_path):
 def test_the_command_line_replaces_axes_and_values(folder):
     found = members(
         folder,
-        "[axes]\nmotor.torque = [1.0, 2.0]\n",
+        "[set]\nframes = 2\n[axes]\nmotor.torque = [1.0, 2.0]\n",
         overrides=["frames=4"],
         grid=["motor.torque=3:4:2", "motor.axis_angle=30,40"],
     )
