@@ -89,6 +89,15 @@ def test_a_mean_is_known_to_a_per_cent_after_as_many_parts_as_its_spread_asks_fo
     assert "differ by 0.9: one part will do" in said and "differ by 1: unknown" in said
 
 
+def test_deviations_of_rates_are_told_over_their_reference():
+    measures = dict.fromkeys(points.MEASURES, 125.0)
+    point = points.Point("start", "float32", "precision", "done", 1.0, 10, measures, {}, np.zeros((2, 22, 3)))
+    row = compared.Row(point, 1e-3, dict.fromkeys(points.MEASURES, 25.0))
+    said = report.text([row], [], windows.Course([], 1e-3, 1e-2, {}, 1e-3))
+    (line,) = (line for line in said.splitlines() if line.startswith("float32"))
+    assert line.count("+25 %") == len({"f_c", "motor_rate", "body_rate", "speed"} & set(points.MEASURES)) > 0
+
+
 def test_a_mesh_that_was_stopped_is_no_reference():
     """Meshes are compared with the finest one that came to its end."""
 
