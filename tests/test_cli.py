@@ -132,6 +132,7 @@ def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypa
         (["run", "small.toml", "--resume", "."], ["either"]),
         (["run", "--resume", "nowhere"], ["nowhere", "scene.toml"]),
         (["run", "--resume", "nowhere", "-o", "elsewhere"], ["--resume", "-o"]),
+        (["run", "--resume", "nowhere", "--precision", "float32"], ["--resume", "--precision"]),
         (["check", "missing.toml"], ["missing.toml", "no such file"]),
         (["check", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
         (["export", "nowhere", "--to", "usd"], ["nowhere", "no such record"]),
