@@ -63,7 +63,8 @@ def test_camera_follows_the_cell(tmp_path):
 def test_a_cell_whose_record_ends_earlier_stays_where_it_is(tmp_path):
     """The camera follows the mean of both, at half the pace from then on."""
     records = [made_record(tmp_path / str(count), count, speed=1.0, offset=(0.0, 0.0, 5.0)) for count in (24, 12)]
-    camera = UsdGeom.Xformable(at(movie_stage(records, Shot(follow=True)), "/World/Camera"))
+    stage = movie_stage(records, Shot(follow=True))
+    camera = UsdGeom.Xformable(at(stage, "/World/Camera"))
     places = np.array([camera.ComputeLocalToWorldTransform(f).ExtractTranslation() for f in range(24)])
     np.testing.assert_allclose(np.diff(places[:, 2]), [-1.0] * 11 + [-0.5] * 12, atol=1e-9)
 
