@@ -15,7 +15,7 @@ from examples.reliability.attempt import OUTCOMES, problem
 from warpflag.scene import paper_scene, with_values
 
 ROOT = Path(__file__).parent.parent.parent
-COUNTS = {"kills": 3, "limits": 2, "damage": 5, "malformed": 30, "random": 2, "extremes": 3, "signals": 2}
+COUNTS = {"kills": 3, "limits": 2, "damage": 5, "malformed": 30, "random": 2, "living": 1, "extremes": 3, "signals": 2}
 SEED = 5
 
 
@@ -37,7 +37,7 @@ def test_the_attack_finds_nothing(tmp_path):
     entries = [json.loads(entry) for entry in (tmp_path / f"attack-{SEED}.jsonl").read_text().splitlines()]
     assert len(entries) == sum(COUNTS.values()) == len({(e["kind"], e["number"]) for e in entries})
     assert {e["outcome"] for e in entries} <= set(OUTCOMES) - set(attack.BAD)
-    assert "| kills | 3 | 3 |" in ended.stdout and "0 of 47 attempts" in ended.stdout
+    assert "| kills | 3 | 3 |" in ended.stdout and "0 of 48 attempts" in ended.stdout
     again = subprocess.run(line, capture_output=True, text=True)
     assert again.stdout == ended.stdout and again.returncode == 0
 
