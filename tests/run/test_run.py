@@ -100,6 +100,9 @@ def test_likely_causes_are_told_the_farthest_from_usual_first():
     assert likely_causes(far) == causes
     (soft,) = likely_causes(small({"flagella.stretching_stiffness": 10.0}))
     assert soft == "flagella.stretching_stiffness = 10, 1/100 of the default"
+    for apart, said in ((0.1, ["anchors 0.1 um apart crowd the flagella"]), (0.13, [])):  # three diameters are 0.12
+        azimuth = 2 * np.degrees(np.arcsin(apart / 0.8))
+        assert likely_causes(small({"flagellum.0.azimuth": 0.0, "flagellum.1.azimuth": azimuth})) == said
     line = str(NumericalError(Fault.STRAIN, 2e-3, 0, 1, 4, far))
     assert "flagellum 1, segment 4: a segment is stretched" in line and "stopped at 2 ms" in line
     assert f"; likely cause: {causes[0]}, {causes[1]}; take a lower motor.torque" in line  # two at most

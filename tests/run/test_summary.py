@@ -56,6 +56,9 @@ def test_rates_are_those_of_the_last_third():
     np.testing.assert_allclose(rates["motor_rate"], [10.0, 20.0])
     np.testing.assert_allclose(rates["motor_rate_lab"], [12.5, 22.5])  # half of the body's turn lies along each motor
     assert rates["net_speed"] == pytest.approx(2.0) and rates["body_rate"] == pytest.approx(5.0)
+    shorter.times = times + 0.1  # a record may begin later
+    rates = digest(shorter, small({"motor.axis_angle": 60.0}))["rates"]
+    assert (rates["from"], rates["to"]) == pytest.approx((0.104, 0.106))
 
 
 def test_rates_of_unequal_intervals_are_weighted_with_them():
