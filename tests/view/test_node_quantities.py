@@ -12,7 +12,7 @@ from tests.runs import executed, small
 from warpflag.model.geometry import ground_state
 from warpflag.observables import local_phase_difference, phase_difference, segment_tangents
 from warpflag.record import Record
-from warpflag.view.coloring import FORM_COLORS, Coloring, linear
+from warpflag.view.coloring import FLAGELLUM_COLORS, FORM_COLORS, Coloring, linear
 from warpflag.view.node_quantities import contact_load, curvature, nearest_phase_difference
 
 STRENGTH, DIAMETER = 0.8, 0.04
@@ -179,3 +179,9 @@ def test_forms_have_a_colour_each_and_ends_that_of_their_neighbour(tmp_path):
     assert np.array_equal(
         np.unique(colors.reshape(-1, 3), axis=0), np.unique([linear(c) for c in FORM_COLORS[:2]], axis=0)
     )
+
+
+def test_more_flagella_than_colours_begin_again_with_the_first(tmp_path):
+    coloring, count = Coloring("flagellum", made_record(tmp_path), THREE), len(FLAGELLUM_COLORS)
+    found = coloring.colors([0, 1, count, count + 1, 2 * count + 1])
+    np.testing.assert_array_equal(found[2:], found[[0, 1, 1]])
