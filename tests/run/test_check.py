@@ -107,37 +107,50 @@ def test_noise_that_stretches_segments_too_far_is_told():
         assert "stretches segments by" in of_noise(with_values(hot, other), 1e-6)[2]
 
 
+class Steady:
+    """A cell that takes 3 s to compile its kernels, 1 s for the start, and then 2 s for a simulated millisecond."""
+
+    first_node, time = np.array([0, 3]), 0.0
+
+    def __init__(self, scene, clock):
+        self.scenes, self.clock = (scene,), clock
+
+    def load(self, recording):
+        self.clock[0] += 3.0
+        return 3.0
+
+    def prepare(self, recording):
+        self.clock[0] += 1.0
+
+    @property
+    def times(self):
+        return np.array([self.time])
+
+    def advance(self, until, watch):
+        self.clock[0] += 2e3 * (until - self.time)
+        self.time = until
+
+    def cell_state(self):
+        nodes = np.arange(9.0).reshape(3, 3)
+        return SimpleNamespace(positions=nodes, directors=nodes, steric_force=0.0)
+
+
 @pytest.mark.parametrize("duration", [2e-4, 2e-3, 0.5])
 def test_the_time_of_stepping_is_told_by_the_speed_of_a_sample(duration, monkeypatch):
-    """Of a cell that takes 3 s to compile its kernels, 1 s for the start, and then 2 s for a simulated millisecond."""
     clock, scene = [0.0], small({"duration": duration, "frames": 10})
-
-    class Steady:
-        scenes, first_node, time = (scene,), np.array([0, 3]), 0.0
-
-        def load(self, recording):
-            clock[0] += 3.0
-            return 3.0
-
-        def prepare(self, recording):
-            clock[0] += 1.0
-
-        @property
-        def times(self):
-            return np.array([self.time])
-
-        def advance(self, until, watch):
-            clock[0] += 2e3 * (until - self.time)
-            self.time = until
-
-        def cell_state(self):
-            nodes = np.arange(9.0).reshape(3, 3)
-            return SimpleNamespace(positions=nodes, directors=nodes, steric_force=0.0)
-
     monkeypatch.setattr("warpflag.run.check.time_needed.time", SimpleNamespace(process_time=lambda: clock[0]))
-    found = needed(Steady())
+    found = needed(Steady(scene, clock))
     assert found.startup == 1.0 and found.compiling == 3.0
     assert found.stepping == pytest.approx(2e3 * duration) and found.sampled == pytest.approx(clock[0] - 4.0)
+
+
+def test_a_crowd_takes_longer_once_it_touches_and_only_where_it_can(monkeypatch):
+    clock, crowds = [0.0], []
+    monkeypatch.setattr("warpflag.run.check.time_needed.time", SimpleNamespace(process_time=lambda: clock[0]))
+    for count, steric in ((2, True), (8, False), (8, True)):
+        scene = small({"flagella.count": count, "steric.enabled": steric, "flagella.phase_difference": None})
+        crowds.append(needed(Steady(scene, clock)).crowd)
+    assert crowds[0] == crowds[1] < crowds[2]
 
 
 @pytest.mark.parametrize("spin", [1.26e-6, 3e-4])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -79,6 +80,24 @@ def test_the_course_is_that_of_the_record_which_is_named(tmp_path, capsys):
     given = [str(tmp_path / "scene.toml"), "-o", str(tmp_path / "made"), "--record", str(tmp_path / "none")]
     assert main(["tradeoff", *given, "--budget", "1"]) == 2
     assert "none: no such record" in capsys.readouterr().err
+
+
+def test_windows_begin_before_what_they_are_named_after():
+    """Of a course of 20 ms in 400 frames, in which flagella touch from 8 ms on and lie side by side from 12 ms on."""
+
+    def frame(k):
+        touching, zipped = k >= 160, k >= 240
+        observables = {"steric_force_density": float(touching), "bundle_length": float(zipped)}
+        observables |= {"body_speed": 1.0, "body_rate": 1.0, "motor_rate": np.ones(2)}
+        nodes = np.zeros((6, 3))
+        own = {"positions": nodes, "directors": nodes, "body_position": nodes[0], "body_orientation": np.eye(4)[3]}
+        return SimpleNamespace(time=k * 5e-5, observables=observables, **own)
+
+    record = SimpleNamespace(frame_count=401, frame=frame, first_node=np.array([0, 3, 6]))
+    course = windows.found_in_record(small(), record)
+    assert [window.name for window in course.windows] == ["start", "contact", "zip", "late"]
+    assert [window.time for window in course.windows] == pytest.approx([5e-5, 7.5e-3, 11.7e-3, 19e-3], abs=5.1e-5)
+    assert course.length == 1e-3
 
 
 def test_a_mean_is_known_to_a_per_cent_after_as_many_parts_as_its_spread_asks_for():

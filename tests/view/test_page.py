@@ -19,7 +19,7 @@ from warpflag import cli
 from warpflag.base.output import OutputError
 from warpflag.record import Record
 from warpflag.scene import paper_scene, with_values
-from warpflag.view.coloring import Coloring
+from warpflag.view.coloring import DISPLAY_RADIUS, Coloring
 from warpflag.view.page import page_of, write_page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -48,6 +48,14 @@ def positions_of(shown: dict) -> np.ndarray:
     nodes = numbers(sent["values"], "<u2").reshape(len(shown["times"]), -1, 3)
     centres = numbers(shown["body"]["positions"], "<f4").reshape(-1, 1, 3)
     return np.array(sent["low"]) + np.array(sent["step"]) * nodes + centres
+
+
+@pytest.mark.parametrize("radius, shown", [(0.01, DISPLAY_RADIUS), (0.2, 0.2)])
+def test_thin_flagella_are_shown_thicker_and_thick_ones_as_they_are(radius, shown, tmp_path):
+    scene = with_values(THREE, {"flagella.filament_radius": radius})
+    with made_record(tmp_path / "run", 2, scene=scene) as record:
+        content = content_of(page_of(record))
+    assert content["radius"] == pytest.approx(radius) and content["displayRadius"] == pytest.approx(shown)
 
 
 def test_the_page_has_the_record_s_frames(record):
