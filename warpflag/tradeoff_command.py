@@ -50,7 +50,7 @@ def tradeoff(options: argparse.Namespace) -> int:
             print(study.execute(options.budget, options.quiet, stop.check))
     except NumericalError as error:  # before the first frame of its course
         return tell(f"{options.scene}: {error}", STOPPED)
-    return DONE
+    return STOPPED if study.stopped else DONE
 
 
 def _seconds(text: str) -> float:

@@ -229,3 +229,25 @@ def test_members_of_a_batch_share_the_time_for_following(tmp_path, monkeypatch):
     achieved.worst.fill_(1e3)
     started.execute_all(quiet=True)
     assert given == [PATIENCE, PATIENCE - 15.0]
+
+
+def test_a_cell_is_followed_with_its_motors_and_forms_as_they_stand(monkeypatch):
+    given = []
+
+    class Taken:
+        def __init__(self, scenes, device, starts, **_options):
+            given.extend(starts)
+
+        def advance(self, until, watch):
+            given.append(until)
+            raise Ended("late", "")
+
+    monkeypatch.setattr("warpflag.run.growth.Simulation", Taken)
+    state = still(3e-3)
+    state.forms = np.ones(22, np.int32)
+    switching = small({"motor.switching": "schedule", "motor.switch_times": [1e-3]})
+    growth(switching, [state], np.array([0, 11, 22]), "cpu", 2e-7)
+    assert given[0].time == given[1].time == 3e-3 < given[2] and given[0].forms is given[1].forms is state.forms
+    given.clear()
+    growth(small(), [state], np.array([0, 11, 22]), "cpu", 2e-7)
+    assert given[0].time == 0.0 < given[2] <= FOLLOWED

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.runs import small
+from tests.runs import executed, small
 from warpflag.cli import main
 from warpflag.model.geometry import initial_state
+from warpflag.record import Record
+from warpflag.run.faults import NumericalError
 from warpflag.run.run_directory import RunError
 from warpflag.run.simulation import Simulation
 from warpflag.run.tradeoff import Study, choices, compared, points, report, windows
@@ -91,9 +94,10 @@ def test_windows_begin_before_what_they_are_named_after():
         observables |= {"body_speed": 1.0, "body_rate": 1.0, "motor_rate": np.ones(2)}
         nodes = np.zeros((6, 3))
         own = {"positions": nodes, "directors": nodes, "body_position": nodes[0], "body_orientation": np.eye(4)[3]}
-        return SimpleNamespace(time=k * 5e-5, observables=observables, **own)
+        return SimpleNamespace(time=k * 5e-5, observables=observables, forms=None, **own)
 
-    record = SimpleNamespace(frame_count=401, frame=frame, first_node=np.array([0, 3, 6]))
+    nodes, text = np.array([0, 3, 6]), dumps(small())
+    record = SimpleNamespace(frame_count=401, frame=frame, first_node=nodes, scene_text=text, path="run.h5")
     course = windows.found_in_record(small(), record)
     assert [window.name for window in course.windows] == ["start", "contact", "zip", "late"]
     assert [window.time for window in course.windows] == pytest.approx([5e-5, 7.5e-3, 11.7e-3, 19e-3], abs=5.1e-5)
@@ -186,3 +190,102 @@ def test_the_front_and_what_is_recommended():
         "standard": "b",
         "careful": "c",
     }
+
+
+def none_late() -> bool:
+    return False
+
+
+def course_of(values, late=none_late) -> windows.Course:
+    return windows.found_by_run(small(values), "cpu", late, lambda share: None)
+
+
+def test_motors_stand_in_a_window_as_they_do_in_the_course():
+    """A motor of given rate that reverses in the middle of the course, within the windows beside that."""
+    values = {"duration": 4e-4, "flagella.count": 1, "flagella.length": 1.0, "motor.law": "rate", "motor.rate": 50.0}
+    scene = small({**values, "motor.switching": "schedule", "motor.switch_times": [2e-4], "motor.switch_ramp": 1e-6})
+    course = windows.found_by_run(scene, "cpu", none_late, lambda share: None)
+    rates = {}
+    for window in course.windows:
+        point = points.measured(scene, course, window, choices.reference(5e-3), "cpu", lambda: None)
+        assert point.status == "done" and 40 <= len(point.positions) <= 42
+        rates[window.name] = point.measures["motor_rate"]
+    assert rates["start"] == pytest.approx(50.0, rel=0.01) and rates["late"] == pytest.approx(-50.0, rel=0.01)
+
+
+def test_forms_go_along_to_windows_files_and_meshes(tmp_path):
+    scene = small({"flagella.count": 1, "polymorphs.enabled": True})
+    forms = np.array([0, 1, 1, 0, 0, 0, 0, 0, 2, 2, 0])
+    shape = dataclasses.replace(initial_state(scene), forms=forms, time=2e-3)
+    course = windows.Course([windows.Window("late", 2e-3, shape)], 1e-3, 3e-3, {}, 1e-4, "stopped")
+    windows.save(course, tmp_path / "course.npz")
+    kept = windows.load(tmp_path / "course.npz")
+    again = kept.windows[0].shape
+    assert np.array_equal(again.forms, forms) and again.time == 2e-3 and kept.cut == "stopped"
+    fine = windows.on_mesh(again, with_values(scene, {"flagella.segment_length": 0.1})).forms
+    assert fine is not None and len(fine) == 21 and np.array_equal(fine[::2], forms)
+    assert np.array_equal(windows.on_mesh(again, scene).forms, forms)
+
+
+def test_a_course_that_ends_early_says_why():
+    wound = {"flagella.length": 2.0, "duration": 4e-4, "motor.torque": 20.0, "flagella.phase_difference": None}
+    course = course_of(wound)
+    said = report.text([], [], course)
+    assert course.until < 4e-4 and "followed to" in said and "stopped at" in said
+    assert "nan" not in said and "no settings to recommend" in said
+    with pytest.raises(NumericalError, match="twisted"):
+        course_of({**wound, "motor.torque": 500.0})
+    late = iter([False, True, *[True] * 100])
+    cut = course_of({"duration": 1.0}, lambda: next(late))
+    assert 0.0 < cut.until < 0.1 and "budget" in cut.cut
+
+
+def test_a_record_of_another_scene_or_of_one_frame_gives_no_course(tmp_path):
+    scene = small({"frames": 2, "duration": 2e-5})
+    with Record(executed(scene, tmp_path / "run")) as record:
+        course = windows.found_in_record(with_values(scene, {"duration": 1e-3, "numerics.accuracy": 1e-3}), record)
+        assert "record" in course.cut
+        with pytest.raises(RunError, match=r"another scene: motor\.torque = 1\.0, recorded with 3\.4"):
+            windows.found_in_record(with_values(scene, {"motor.torque": 1.0}), record)
+
+
+def test_damaged_points_are_measured_again_and_none_is_lost(studied, tmp_path, capsys):
+    directory = shutil.copytree(studied[0], tmp_path / "made")
+    every, (damaged, gone, *_) = len(list((directory / "points").iterdir())), sorted((directory / "points").iterdir())
+    damaged.write_bytes(damaged.read_bytes()[:500])
+    gone.unlink()
+    said = Study(small(SCENE), str(directory), "cpu").execute(0.01, quiet=True)
+    assert f"{every - 2} points" in said and "0000.npz: can't be read" in capsys.readouterr().err
+    (directory / "course.npz").write_bytes(b"")
+    with pytest.raises(RunError, match=r"course\.npz: can't be read"):
+        Study(small(SCENE), str(directory), "cpu").execute(0.01, quiet=True)
+    (directory / "course.npz").unlink()
+    with pytest.raises(RunError, match=r"no course\.npz"):
+        Study(small(SCENE), str(directory), "cpu")
+
+
+def test_no_run_goes_on_in_the_directory_of_a_study(studied, capsys):
+    assert main(["run", "--resume", str(studied[0])]) == 2
+    assert "holds a trade-off" in capsys.readouterr().err
+    (studied[0].parent / "scene.toml").write_text(dumps(small(SCENE)))
+    assert main(["run", str(studied[0].parent / "scene.toml"), "-o", str(studied[0])]) == 2
+    assert "holds a trade-off" in capsys.readouterr().err
+
+
+def test_what_was_not_compared_is_not_said_to_be_off():
+    """One window of two has a point beside its reference, the other a reference that was stopped."""
+
+    def point(window: str, choice: str, status: str) -> points.Point:
+        settings = {"stepper": "implicit", "accuracy": 5e-3}
+        measures = dict.fromkeys(points.MEASURES, 1.0)
+        return points.Point(window, choice, "time step", status, 1.0, 10, measures, settings, np.zeros((2, 9, 3)))
+
+    given = [point("late", "reference", "done"), point("late", "accuracy 0.005", "done")]
+    given += [point("start", "reference", "stopped: accuracy")]
+    rows = compared.compared(given)
+    found = compared.summaries(rows, 1e-3)
+    begins = [windows.Window(name, 0.0, initial_state(small())) for name in ("start", "late")]
+    said = report.text(rows, found, windows.Course(begins, 1e-3, 1e-2, {}, 1e-3))
+    assert "nothing is compared in window start: its reference was stopped: accuracy" in said
+    assert "+0 %" not in said.split("mesh of the scene")[1].split("\n")[0]
+    assert "standard: accuracy 0.005" in said and "in 1 of 2 windows" in said

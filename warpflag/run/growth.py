@@ -204,11 +204,14 @@ def _looks(
 ) -> Iterator[Growth]:
     """The growth from one state at `_LOOKS` times, until a guard stops the pair or `watch` raises."""
     size = _DISTURBANCE[scene.numerics.precision]
+    begun = state.time if scene.motor.switching != "none" else 0.0  # motors stand as they did then
     start = InitialState(
         tuple(np.split(state.positions, first_node[1:-1])),
         tuple(np.split(state.directors, first_node[1:-1])),
         state.body_position,
         state.body_orientation,
+        begun,
+        forms=getattr(state, "forms", None),
     )
     noise = np.random.default_rng(0)
     moved = [nodes.copy() for nodes in start.positions]
@@ -223,7 +226,7 @@ def _looks(
         least, between = np.inf, 1.0
         for k in range(_LOOKS):
             within = followed * (k + 1) / _LOOKS
-            pair.advance(within, watch)
+            pair.advance(begun + within, watch)
             one, two = np.split(pair.cells().positions, 2)
             factor = float(np.linalg.norm(one - two, axis=1).max()) / size
             least = min(least, factor)

@@ -19,6 +19,7 @@ from warpflag.run.lock import SWEEP_NAME, Lock
 from warpflag.scene import Scene, SceneError, dumps, load, loads
 
 __all__ = [
+    "COURSE_NAME",
     "MOVIE_NAME",
     "SCENE_NAME",
     "SUMMARY_NAME",
@@ -34,6 +35,8 @@ __all__ = [
 ]
 
 MOVIE_NAME, SCENE_NAME, SUMMARY_NAME = "movie.usdc", "scene.toml", "summary.json"
+COURSE_NAME = "course.npz"
+"""What only the directory of a trade-off has, beside a scene."""
 _NOT_OF_THE_MOTION = ("duration", "frames", "behaviour")
 
 
@@ -65,6 +68,9 @@ def claim_directory(name: str, output: str | None) -> tuple[Path, Lock]:
             raise
         named = f"-o {output}" if output else f"runs/{name}"
         raise RunError(f"{named}: can't be made: {error.strerror}") from None
+    if (directory / COURSE_NAME).exists():
+        lock.release()
+        raise RunError(f"-o {output}: holds a trade-off (warpflag tradeoff); name another -o")
     for taken in (RECORD_NAME, SCENE_NAME, SUMMARY_NAME, SWEEP_NAME):
         if (directory / taken).exists():
             lock.release()
@@ -169,6 +175,8 @@ def recorded_scene(directory: Path, prolonged: bool) -> Scene:
     path, record_path = directory / SCENE_NAME, directory / RECORD_NAME
     if not path.is_file():
         raise RunError(f"--resume {directory}: holds no run, there is no {SCENE_NAME}")
+    if (directory / COURSE_NAME).exists() and not record_path.exists():
+        raise RunError(f"--resume {directory}: holds a trade-off, which warpflag tradeoff goes on with, and no run")
     if not path.read_text(encoding="utf-8", errors="replace").strip():
         raise RunError(f"--resume {directory}: {SCENE_NAME} is empty; the record's /parameters/scene has its text")
     scene = load(path)

@@ -9,10 +9,12 @@ from warpflag.scene import Scene, SceneError, with_values
 from warpflag.scene.run_sections import ACCURACY_LEVELS
 from warpflag.stepping.stepper import DEFAULT_ACCURACY
 
-__all__ = ["SOURCES", "Choice", "choices_of", "reference", "relative_cost"]
+__all__ = ["REFERENCE", "SOURCES", "Choice", "choices_of", "reference", "relative_cost"]
 
 SOURCES = ("time step", "precision", "mesh", "model", "execution")
 """What an error comes from, in the order of the report."""
+REFERENCE = "reference"
+"""Name of what all others are compared with."""
 _DRAFT, _CAREFUL = ACCURACY_LEVELS["draft"], ACCURACY_LEVELS["careful"]
 _ACCURACIES = (_DRAFT, 2e-2, 1e-2, DEFAULT_ACCURACY, 2e-3, 1e-3, _CAREFUL, 1e-4)  # um per ms, of the implicit stepper
 _RKC_ACCURACIES = (_DRAFT, DEFAULT_ACCURACY)  # finer ones take minutes
@@ -58,7 +60,7 @@ _EXACT = {**_IMPLICIT, "numerics.pair_precision": "same"}
 
 def reference(accuracy: float) -> Choice:
     """What all others are compared with, at this accuracy [um/ms]."""
-    return Choice("reference", "time step", {**_EXACT, "numerics.accuracy": accuracy}, turn=-1)
+    return Choice(REFERENCE, "time step", {**_EXACT, "numerics.accuracy": accuracy}, turn=-1)
 
 
 def relative_cost(choice: Choice, scene: Scene) -> float:
@@ -141,9 +143,12 @@ def _switched(scene: Scene, standard: dict[str, Any]) -> list[Choice]:
 
 def _allowed(choice: Choice, scene: Scene) -> bool:
     try:
-        choice.scene(scene)
+        own = choice.scene(scene)
     except SceneError:
         return False
+    if choice.source == "mesh":  # not where every flagellum has a number of segments of its own
+        here, there = ([spec.segment_count for spec in one.resolved_flagella()] for one in (scene, own))
+        return here != there
     if choice.values.get("numerics.pair_precision") == "float32":
         return scene.hydrodynamics.mode != "none"
     return True

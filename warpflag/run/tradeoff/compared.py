@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warpflag.run.tradeoff.choices import REFERENCE
 from warpflag.run.tradeoff.points import MEASURES, Point
 from warpflag.scene.run_sections import ACCURACY_LEVELS
 
@@ -25,7 +26,8 @@ class Row:
     Attributes:
         point: of a window and a choice.
         node_error: largest displacement of a node from the reference in the window [um]; NaN on other meshes.
-        off: of each of `MEASURES`, from the reference: the run with the finest steps; of meshes the finest mesh.
+        off: of each of `MEASURES`, from the reference: the run with the finest steps; of meshes the finest mesh. NaN of
+            a reference without a finer mesh beside it, and of all in a window whose reference was stopped.
     """
 
     point: Point
@@ -61,7 +63,7 @@ def compared(points: Sequence[Point]) -> list[Row]:
     rows = []
     for window in dict.fromkeys(point.window for point in points):
         own = [point for point in points if point.window == window]
-        exact = next((point for point in own if point.choice == "reference"), None)
+        exact = next((point for point in own if point.choice == REFERENCE), None)
         if exact is None:
             continue
         meshes = [point for point in own if point.source == "mesh" and point.status == "done"]
@@ -70,6 +72,9 @@ def compared(points: Sequence[Point]) -> list[Row]:
             beside = finest if point.source == "mesh" or point is exact else exact
             off = {name: point.measures[name] - beside.measures[name] for name in MEASURES}
             error = float("nan")
+            if exact.status != "done" or (point is exact and beside is exact):
+                rows.append(Row(point, error, dict.fromkeys(MEASURES, error)))
+                continue
             if point is not exact and point.positions.shape == exact.positions.shape and point.source != "mesh":
                 error = float(np.linalg.norm(point.positions - exact.positions, axis=2).max())
             rows.append(Row(point, error, off))
@@ -87,13 +92,13 @@ def summaries(rows: Sequence[Row], length: float) -> list[Summary]:
     for name in dict.fromkeys(row.point.choice for row in rows):
         own = [row for row in rows if row.point.choice == name]
         first = own[0].point
-        errors = [row.node_error / (length * 1e3) for row in own]
+        errors = [row.node_error / (length * 1e3) for row in own if not math.isnan(row.node_error)]
         found.append(
             Summary(
                 choice=name,
                 source=first.source,
                 cost=float(np.mean([row.point.cost for row in own])),
-                error=float(np.max(errors)),
+                error=max(errors, default=float("nan")),
                 windows=len(own),
                 sound=all(row.point.status == "done" for row in own),
                 settings=dict(first.settings),
@@ -103,9 +108,9 @@ def summaries(rows: Sequence[Row], length: float) -> list[Summary]:
 
 
 def _candidates(found: Sequence[Summary]) -> list[Summary]:
-    """Sound settings of time step and precision that were measured wherever anything was."""
-    most = max((summary.windows for summary in found), default=0)
+    """Sound settings of time step and precision that were compared in as many windows as any of them."""
     timed = [s for s in found if s.source in _TIMED and s.sound and not math.isnan(s.error)]
+    most = max((s.windows for s in timed), default=0)
     return [s for s in timed if s.windows == most]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from warpflag.base.output import OutputError
 from warpflag.run.tradeoff.compared import Summary, front
 from warpflag.view import figures
 
@@ -20,12 +21,14 @@ def draw(found: Sequence[Summary], title: str, path: Path) -> None:
     """Every choice that has a node error, and the front, whose members are numbered and named beside it.
 
     Raises:
-        OutputError: matplotlib is missing, or the file can't be written.
+        OutputError: no choice has one, matplotlib is missing, or the file can't be written.
     """
+    shown = [s for s in found if _kind(s) and not math.isnan(s.error) and s.error > 0]
+    if not shown:
+        raise OutputError("nothing was compared with a reference yet")
     with figures.styled() as figure_of:
         figure = figure_of(figsize=(0.8 * figures.TWO_COLUMNS, 3.0), layout="constrained")
         axis = figure.subplots()
-        shown = [s for s in found if _kind(s) and not math.isnan(s.error) and s.error > 0]
         most = max((s.windows for s in found), default=0)
         for k, (kind, mark) in enumerate(_MARKS.items()):
             label, color = kind, figures.COLORS[k]
@@ -58,12 +61,14 @@ def draw(found: Sequence[Summary], title: str, path: Path) -> None:
 
 
 def _set_ticks(side: Any, values: Sequence[float]) -> None:
-    """Ticks of a logarithmic axis with plain numbers: at decades, at 1, 2 and 5 of them, or evenly within one."""
-    from matplotlib.ticker import AutoLocator, LogLocator, NullLocator, StrMethodFormatter
+    """Ticks of a logarithmic axis with plain numbers: at decades, at 1, 2 and 5 of them, or evenly between two."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
-    span = max(values) / min(values) if values else 1.0
+    span = max(values) / min(values)
     subs = (1.0,) if span > 100.0 else (1.0, 2.0, 5.0)
-    side.set_major_locator(LogLocator(subs=subs) if span > 10.0 else AutoLocator())
+    steps = range(math.floor(math.log10(min(values))), math.ceil(math.log10(max(values))) + 1)
+    within = [sub * 10.0**k for k in steps for sub in subs if min(values) <= sub * 10.0**k <= max(values)]
+    side.set_major_locator(LogLocator(subs=subs) if len(within) > 1 else MaxNLocator(4))
     side.set_minor_locator(NullLocator())
     side.set_major_formatter(StrMethodFormatter("{x:g}"))
 

@@ -16,7 +16,7 @@ from warpflag.observables.arrays import Array
 from warpflag.run.faults import NumericalError
 from warpflag.run.simulation import Simulation
 from warpflag.run.tradeoff.choices import Choice
-from warpflag.run.tradeoff.windows import Course, Window, on_mesh
+from warpflag.run.tradeoff.windows import Course, Window, arrays_of, on_mesh
 from warpflag.scene import Scene, with_values
 
 __all__ = ["MEASURES", "Point", "load", "measured", "save"]
@@ -71,7 +71,9 @@ def measured(
     Raises:
         SceneError: the scene can't be run in this way from this shape.
     """
-    own = with_values(choice.scene(scene), {"duration": course.length, "frames": _WINDOW_FRAMES, "start.record": None})
+    until = window.shape.time + course.length
+    frames_until = round(_WINDOW_FRAMES * until / course.length)
+    own = with_values(choice.scene(scene), {"duration": until, "frames": frames_until, "start.record": None})
     start = on_mesh(window.shape, own)
     cost = np.inf
     while True:
@@ -80,7 +82,7 @@ def measured(
         frames, status = [], "done"
         began = time.process_time()
         try:
-            frames += simulation.frames(course.length, watch)
+            frames += simulation.frames(until, watch)
         except NumericalError as error:
             status = f"stopped: {error.kind.name.lower()}"
         taken = time.process_time() - began
@@ -107,7 +109,10 @@ def save(point: Point, path: Path) -> None:
         np.savez_compressed(file, said=np.array(json.dumps(said)), positions=point.positions)
 
 
-def load(path: Path) -> Point:
-    """What `save` wrote."""
-    with np.load(path) as kept:
+def load(path: Path) -> Point | None:
+    """What `save` wrote; None where the file is damaged."""
+    try:
+        kept = arrays_of(path)
         return Point(**json.loads(str(kept["said"])), positions=kept["positions"])
+    except (KeyError, TypeError, ValueError):
+        return None

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from warpflag.base.output import whole
-from warpflag.run.tradeoff.choices import SOURCES
+from warpflag.run.tradeoff.choices import REFERENCE, SOURCES
 from warpflag.run.tradeoff.compared import LEVELS, Row, Summary, front, recommended
 from warpflag.run.tradeoff.points import MEASURES
 from warpflag.run.tradeoff.windows import Course
@@ -34,14 +34,29 @@ def write_csv(rows: Sequence[Row], course: Course, path: Path) -> None:
             table.writerow([*begin, *(f"{x:.6g}" for x in numbers)])
 
 
-def text(rows: Sequence[Row], found: Sequence[Summary], course: Course) -> str:
-    """The report of a study: costs, errors by source, lengths of runs, settings to paste."""
+def text(
+    rows: Sequence[Row], found: Sequence[Summary], course: Course, unstartable: Mapping[str, str] | None = None
+) -> str:
+    """The report of a study: costs, errors by source, lengths of runs, settings to paste.
+
+    Args:
+        rows: of `compared`.
+        found: of `summaries`.
+        course: that the windows belong to.
+        unstartable: why no run begins with a window's shape, by window.
+    """
     windows = ", ".join(f"{window.name} from {1e3 * window.time:.3g} ms" for window in course.windows)
-    lines = [f"windows of {1e3 * course.length:.3g} ms: {windows}", ""]
-    lines += _costs(found, course)
+    lines = [f"windows of {1e3 * course.length:.3g} ms: {windows}"]
+    if course.cut:
+        lines.append(f"the course was followed to {1e3 * course.until:.4g} ms, not to the scene's end: {course.cut}")
+    lines += [f"no run begins with the shape of window {name}: {why}" for name, why in (unstartable or {}).items()]
+    for row in rows:
+        if row.point.choice == REFERENCE and row.point.status != "done":
+            lines.append(f"nothing is compared in window {row.point.window}: its reference was {row.point.status}")
+    lines += ["", *_costs(found, course)]
     lines += _sources(rows)
     lines += _lengths(course)
-    lines += _blocks(found)
+    lines += _blocks(found, len(course.windows))
     return "\n".join(lines)
 
 
@@ -58,11 +73,8 @@ def _costs(found: Sequence[Summary], course: Course) -> list[str]:
             lines.append(
                 f"{s.choice:30}{s.source:12}{_number(s.cost):>10}{error:>18}{s.windows:6d}/{len(course.windows)}{mark}"
             )
-    return [
-        *lines,
-        "* on the Pareto front: nothing cheaper is as accurate; mean cost, largest error of all windows",
-        "",
-    ]
+    front_is = "* on the Pareto front: nothing cheaper is as accurate; " if best else ""
+    return [*lines, f"{front_is}mean cost, largest error of all windows", ""]
 
 
 def _number(x: float) -> str:
@@ -77,7 +89,7 @@ def _sources(rows: Sequence[Row]) -> list[str]:
         "-" * 102,
     ]
     shown = [("time step at 5e-3", [r for r in rows if r.point.choice == _STANDARD])]
-    shown += [("mesh of the scene", [r for r in rows if r.point.choice == "reference"])]
+    shown += [("mesh of the scene", [r for r in rows if r.point.choice == REFERENCE])]
     others = dict.fromkeys(r.point.choice for r in rows if r.point.source in ("precision", "mesh", "model"))
     shown += [(name, [r for r in rows if r.point.choice == name]) for name in others]
     for name, own in shown:
@@ -100,7 +112,9 @@ def _relative(row: Row, measure: str) -> float:
 
 
 def _shown(x: float, measure: str) -> str:
-    return f"{100 * x:+.2g} %" if measure in _UNITS else f"{x:+.1e}"
+    if measure not in _UNITS:
+        return f"{x:+.1e}"
+    return f"{100 * x:+.2g} %" if abs(x) < 0.995 else f"{100 * x:+.0f} %"
 
 
 def _lengths(course: Course) -> list[str]:
@@ -111,6 +125,12 @@ def _lengths(course: Course) -> list[str]:
     """
     lines = [f"means over the last third of {1e3 * course.until:.4g} ms, and the time that knows them to 1 %:"]
     for name, (mean, spread) in course.rates.items():
+        if mean == spread == 0.0:
+            lines.append(f"  {name}: 0 throughout")
+            continue
+        if math.isnan(spread):
+            lines.append(f"  {name}: {mean:.4g}, from a single frame: unknown")
+            continue
         parts = (spread / (0.01 * abs(mean))) ** 2 if mean else float("nan")
         told = f"{1e3 * course.span * parts:.3g} ms" if parts > 1.0 else "one part will do"
         if math.isnan(parts):
@@ -119,15 +139,19 @@ def _lengths(course: Course) -> list[str]:
     return [*lines, ""]
 
 
-def _blocks(found: Sequence[Summary]) -> list[str]:
+def _blocks(found: Sequence[Summary], windows: int) -> list[str]:
     best = recommended(found)
+    if not front(found):
+        return ["# no settings to recommend: none was compared with a reference and came to its end", ""]
     lines = []
     for level, allowed in LEVELS.items():
         if level not in best:
             lines += [f"# {level}: nothing measured keeps {allowed:g} um per ms here", ""]
             continue
         s = best[level]
-        lines += [f"# {level}: {s.choice}, {s.cost:.3g} ms per ms, node error {s.error:.1e} um per ms", "[numerics]"]
+        where = "" if s.windows == windows else f", in {s.windows} of {windows} windows"
+        said = f"# {level}: {s.choice}, {s.cost:.3g} ms per ms, node error {s.error:.1e} um per ms{where}"
+        lines += [said, "[numerics]"]
         for key, value in s.settings.items():
             if value is not None:
                 lines.append(f"{key} = " + (f'"{value}"' if isinstance(value, str) else f"{value:g}"))

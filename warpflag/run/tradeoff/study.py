@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections.abc import Callable
@@ -11,17 +12,18 @@ from time import monotonic
 from warpflag.base.device import list_devices
 from warpflag.base.output import OutputError
 from warpflag.base.progress import bar
-from warpflag.base.streams import is_terminal, say
-from warpflag.record import Record
-from warpflag.run.lock import Lock
-from warpflag.run.run_directory import SCENE_NAME, RunError, check_same_scene, write_whole
+from warpflag.base.streams import is_terminal, say, tell
+from warpflag.record import RECORD_NAME, Record
+from warpflag.run.lock import SWEEP_NAME, Lock
+from warpflag.run.run_directory import COURSE_NAME, SCENE_NAME, SUMMARY_NAME, RunError, check_same_scene, write_whole
 from warpflag.run.simulation import Simulation
 from warpflag.run.tradeoff import choices, compared, plot, points, report, windows
+from warpflag.run.tradeoff.choices import REFERENCE
 from warpflag.scene import Scene, SceneError, dumps
 
 __all__ = ["Study"]
 
-_COURSE_NAME, _POINTS = "course.npz", "points"
+_POINTS = "points"
 _COURSE_SHARE = 0.25  # of the budget, at most, goes into the coarse run
 _REFERENCE_SHARE = 0.3  # and into the references of all windows
 _REFERENCES = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)  # accuracies, the finest that there is time for [um/ms]
@@ -55,21 +57,43 @@ class Study:
         Simulation(scene, device=device)  # refuses what can't be simulated, before anything is written
         self._scene, self._device, self._record = scene, device, record
         self.directory = Path(output or f"runs/{scene.name}-tradeoff")
-        if (self.directory / "run.h5").exists():
-            raise RunError(f"-o {self.directory}: holds a run; name another -o")
+        for taken, what in ((RECORD_NAME, "run"), (SUMMARY_NAME, "run"), (SWEEP_NAME, "sweep")):
+            if (self.directory / taken).exists():
+                raise RunError(f"-o {self.directory}: holds a {what}; name another -o")
         try:
             (self.directory / _POINTS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise RunError(f"-o {self.directory}: can't be made: {error.strerror}") from None
-        self._lock = Lock(self.directory)
-        if (self.directory / SCENE_NAME).exists():
-            check_same_scene(self.directory, scene)
-        else:
-            write_whole(self.directory / SCENE_NAME, dumps(scene))
         self._points: dict[tuple[str, str], points.Point] = {}
+        self._unstartable: dict[str, str] = {}  # windows whose reference can't begin with their shape, and why
+        self._lock = Lock(self.directory)
+        try:
+            self._open()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _open(self) -> None:
+        """Reads what the directory holds."""
+        if (self.directory / SCENE_NAME).exists():
+            check_same_scene(self.directory, self._scene)
+        else:
+            write_whole(self.directory / SCENE_NAME, dumps(self._scene))
         for path in sorted((self.directory / _POINTS).glob("*.npz")):
-            point = points.load(path)
-            self._points[point.window, point.choice] = point
+            if (point := points.load(path)) is None:
+                path.unlink()
+                tell(f"{path}: can't be read, and is measured again")
+            else:
+                self._points[point.window, point.choice] = point
+        if self._points and not (self.directory / COURSE_NAME).exists():
+            problem = f"has points, but no {COURSE_NAME} that says where their windows are; remove it"
+            raise RunError(f"-o {self.directory}: {problem}, or name another -o")
+
+    @property
+    def stopped(self) -> bool:
+        """Whether guards have stopped the reference of every window that was begun."""
+        references = [point for point in self._points.values() if point.choice == REFERENCE]
+        return bool(references) and all(point.status != "done" for point in references)
 
     def execute(self, budget: float, quiet: bool = False, check: Callable[[], None] = lambda: None) -> str:
         """Measures for so many seconds of wall time; returns the report.
@@ -96,7 +120,7 @@ class Study:
                 left = deadline - monotonic()
                 if left <= 0.0:
                     break
-                if self._expected(choice, course) < left:
+                if self._is_comparable(window, choice) and self._expected(choice, course) < left:
                     self._take(course, window, choice, deadline, check)
         except _OutOfTime:
             pass
@@ -104,7 +128,7 @@ class Study:
             line.close()
 
     def _course(self, until: float, line: _Line, check: Callable[[], None]) -> windows.Course:
-        path = self.directory / _COURSE_NAME
+        path = self.directory / COURSE_NAME
         if path.exists():
             return windows.load(path)
         if self._record is not None:
@@ -143,7 +167,7 @@ class Study:
     def _reference_accuracy(self, course: windows.Course, deadline: float) -> float:
         """The finest accuracy for which there is time, from a first coarse point [um/ms]."""
         for point in self._points.values():
-            if point.choice == "reference":
+            if point.choice == REFERENCE:
                 return float(point.settings["accuracy"])
         window, coarse = course.windows[-1], choices.reference(5e-3)
         try:
@@ -158,12 +182,17 @@ class Study:
                 return accuracy
         return _REFERENCES[-1]
 
+    def _is_comparable(self, window: windows.Window, choice: choices.Choice) -> bool:
+        """Whether the window has a reference that came to its end, or this is to be it."""
+        reference = self._points.get((window.name, REFERENCE))
+        return choice.name == REFERENCE or (reference is not None and reference.status == "done")
+
     def _expected(self, choice: choices.Choice, course: windows.Course) -> float:
         """Seconds that a point takes, by what others took; compiling is not foreseen."""
         costs = []
         for point in self._points.values():
-            accuracy = point.settings.get("accuracy")
-            if accuracy and point.source == "time step" and point.settings["stepper"] == "implicit":
+            accuracy, implicit = point.settings.get("accuracy"), point.settings["stepper"] == "implicit"
+            if point.status == "done" and accuracy and point.source == "time step" and implicit:
                 own = choices.reference(float(accuracy))
                 costs.append(point.cost * course.length / choices.relative_cost(own, self._scene))
         return choices.relative_cost(choice, self._scene) * min(costs) if costs else 0.0
@@ -178,10 +207,12 @@ class Study:
     ) -> None:
         try:
             point = points.measured(self._scene, course, window, choice, self._device, self._watch(deadline, check))
-        except SceneError:
-            return  # a shape that this choice can't start from
-        number = len(self._points)
-        points.save(point, self.directory / _POINTS / f"{number:04d}.npz")
+        except SceneError as error:  # a shape that this choice can't start from
+            if choice.name == REFERENCE:
+                self._unstartable[window.name] = str(error)
+            return
+        paths = (self.directory / _POINTS / f"{number:04d}.npz" for number in itertools.count())
+        points.save(point, next(path for path in paths if not path.exists()))
         self._points[window.name, choice.name] = point
 
     def _watch(self, deadline: float, check: Callable[[], None]) -> Callable[[], None]:
@@ -194,7 +225,7 @@ class Study:
 
     def _told(self) -> str:
         """Writes table and figure of what has been measured; returns the report."""
-        path = self.directory / _COURSE_NAME
+        path = self.directory / COURSE_NAME
         rows = compared.compared(list(self._points.values()))
         if not path.exists() or not rows:
             return f"{self.directory}: the budget was too short for any point; run it again to go on"
@@ -207,8 +238,9 @@ class Study:
             made.append(plot.FIGURE_NAME)
         except OutputError as error:
             made.append(f"no figure: {error}")
-        written = f"{len(self._points)} points: {self.directory}: {', '.join(made)}"
-        return report.text(rows, found, course) + "\n" + written
+        count = len(self._points)
+        written = f"{count} point{'s'[: count != 1]}: {self.directory}: {', '.join(made)}"
+        return report.text(rows, found, course, self._unstartable) + "\n" + written
 
 
 class _Line:
