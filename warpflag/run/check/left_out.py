@@ -68,7 +68,8 @@ def hook(scene: Scene, stiff: Turning) -> str | None:
     """The hook's stiffness over the torque, which says whether it keeps the filament along the motor's axis."""
     if not _has_body(scene) or scene.hook.stiffness:
         return None
-    torque = max(abs(spec.torque) for spec in scene.resolved_flagella())
+    specs = scene.resolved_flagella()
+    torque = max(stiff.drag * abs(spec.rate) if spec.law == "rate" else abs(spec.torque) for spec in specs)
     if torque == 0.0:
         return None
     ratio = _HOOK_STIFFNESS / torque
@@ -109,15 +110,22 @@ def mesh(scene: Scene, stiff: Turning) -> str | None:
     if found is None:
         many = max(spec.segment_count for spec in scene.resolved_flagella())
         return f"mesh: not looked at with {many} segments" if many > 0.5 * rigid.MOST_SEGMENTS else None
-    h = max(spec.segment_length for spec in scene.resolved_flagella())
+    h = max(scene.resolved_flagella(), key=lambda spec: spec.length).segment_length
     more = "" if scene.hydrodynamics.mode in ("none", "between", "consistent") else ", and more with finer ones"
+    if not _has_body(scene):
+        what = f"how easily the filament turns about its axis is with h = {h:.3g} um"
+        return f"mesh: {what} about {100 * found:+.1f} % off that with half of it{more}"
     return f"mesh: rates with h = {h:.3g} um are about {100 * found:+.1f} % off those with half of it{more}"
 
 
 def inertia(scene: Scene, stiff: Turning) -> str | None:
-    """The Reynolds number of a turning flagellum."""
-    number = _DENSITY * stiff.tip_speed * stiff.radius / scene.fluid.viscosity
-    return f"inertia: Reynolds number {number:.0e}"
+    """The Reynolds number of a turning flagellum, or of one that is pulled."""
+    spec = max(scene.resolved_flagella(), key=lambda own: own.length)
+    across = filament_mobility(scene, spec.segment_length).across * spec.segment_length
+    speed = max(stiff.tip_speed, math.hypot(*scene.external.force_per_length) * across)
+    if speed == 0.0:
+        return None
+    return f"inertia: Reynolds number {_DENSITY * speed * stiff.radius / scene.fluid.viscosity:.0e}"
 
 
 def lubrication(scene: Scene, stiff: Turning) -> str | None:

@@ -45,10 +45,13 @@ def of_noise(scene: Scene, step: float) -> list[str]:
     said = [
         f"thermal noise, {scene.fluid.temperature:g} K, kT {energy:.4g} pN um: {method}, fixed steps; energies of "
         "joints err by up to 0.5 % at 1e-5 s and 300 K, gaps of contacts by 5 % at 1e-6 s, driven motion in "
-        "proportion to the step: halve it and compare",
-        f"noise alone turns a flagellum about its hook: tip by about {tip(scene.duration):.2g} um in "
-        f"{1e3 * scene.duration:g} ms, {tip(step):.1g} um in a step",
+        "proportion to the step: halve it and compare"
     ]
+    if scene.body.enabled:
+        said.append(
+            f"noise alone turns a flagellum about its hook: tip by about {tip(scene.duration):.2g} um in "
+            f"{1e3 * scene.duration:g} ms, {tip(step):.1g} um in a step"
+        )
     shortest = min(own.segment_length for own in scene.resolved_flagella())
     strain = math.sqrt(energy / (scene.flagella.stretching_stiffness * shortest))
     if DEVIATIONS * strain > LARGEST_STRAIN:

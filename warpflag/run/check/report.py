@@ -19,6 +19,9 @@ from warpflag.scene import Scene, dumps, flagellum_example
 
 __all__ = ["report"]
 
+_RECORD_BYTES, _ENTRY_BYTES = 62_000, 4_500  # of a record without frames, scene and all; of a further entry; measured
+_CHUNK_BYTES = 1 << 20  # of a chunk of frames
+
 
 def report(scene: Scene, device: str | None = None) -> str:
     """The resolved scene as TOML, and below it as comments what it requires and what it leaves out.
@@ -41,7 +44,6 @@ def report(scene: Scene, device: str | None = None) -> str:
     model = simulation.system.model
     names = ", ".join(name for name, _launch in stages(model))
     longest = float(simulation.system.control.longest_step.numpy()[0])
-    values_per_frame = 6 * nodes + 2 * len(flagella) + 14
     if nodes > large.LARGEST:
         time, parts = large.needed_by_parts(scene, built, device)
         simulation.take_frames()
@@ -49,12 +51,12 @@ def report(scene: Scene, device: str | None = None) -> str:
         time, parts = needed(simulation), []
     stiff = turning(scene)
     lines = [
-        f"{len(flagella)} flagella, {segments} segments, {nodes} nodes",
+        f"{len(flagella)} {'flagella' if len(flagella) > 1 else 'flagellum'}, {segments} segments, {nodes} nodes",
         f"stages of a right-hand side: {names}",
         f"plan: {model.plan.summary()}",
         f"device {simulation.device.alias} ({simulation.device.name}), {scene.numerics.precision}",
         f"memory {_mebibytes(_device_bytes(simulation))} on the device, "
-        f"record {_mebibytes(8 * values_per_frame * (scene.frames + 1))}",
+        f"record {_mebibytes(_record_bytes(simulation, nodes))}",
         f"stepper {scene.numerics.stepper}, step at most {longest:.3g} s",
         *_times(time, scene, parts),
         *simulation.notes[0],
@@ -75,16 +77,29 @@ def report(scene: Scene, device: str | None = None) -> str:
 
 def _times(time: Needed, scene: Scene, parts: list[int]) -> list[str]:
     per_ms = time.stepping / (1e3 * scene.duration)
+    least, most = f"{time.least:.2g}", f"{time.most:.2g}"
+    touching = scene.steric.enabled and (len(scene.resolved_flagella()) > 1 or scene.steric.self_contact)
     lines = [
-        f"time {time.least:.2g} to {time.most:.2g} s of computing: start {time.startup:.1f} s, stepping "
-        f"{time.stepping:.2g} s ({1e3 * per_ms:.3g} ms per simulated ms; up to {time.crowd:.2g} times that where "
-        f"flagella touch), frames, record and movie {time.output:.2g} s"
+        f"time {least if least == most else f'{least} to {most}'} s of computing: start {time.startup:.1f} s, stepping "
+        f"{time.stepping:.2g} s ({1e3 * per_ms:.3g} ms per simulated ms; up to {time.crowd:.2g} times that "
+        f"{'where flagella touch' if touching else 'later'}), frames, record and movie {time.output:.2g} s"
     ]
     if parts:
         lines.append(f"which is a guess: from parts of it with {' and '.join(map(str, parts))} nodes")
     if time.compiling:
         lines.append(f"kernels were compiled just now, in {time.compiling:.0f} s, and are in the cache")
     return lines
+
+
+def _record_bytes(simulation: Simulation, nodes: int) -> int:
+    """Of the record: what a frame has of each node, of each flagellum, and of the cell with its checksums; frames are
+    stored in chunks."""
+    scene, switches = simulation.scenes[0], simulation.system.model.switches
+    count, frames = len(scene.resolved_flagella()), scene.frames + 1
+    law, forms = switches.has("motor law"), switches.has("polymorphs")
+    per_frame = 8 * (6 * nodes + (4 if law else 2) * count + 23) + forms * nodes
+    chunk = min(max(_CHUNK_BYTES // (24 * nodes), 16), max(min(frames, 64), 16))
+    return _RECORD_BYTES + (2 * law + forms) * _ENTRY_BYTES + per_frame * -(-frames // chunk) * chunk
 
 
 def _device_bytes(simulation: Simulation) -> int:

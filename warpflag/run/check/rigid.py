@@ -29,7 +29,7 @@ class Turning:
     """A stiff flagellum of the scene under its motor's torque, free to move along its axis.
 
     Attributes:
-        rate: of its rotation [Hz].
+        rate: of its rotation, by the law of its motor [Hz]; 0 without a body.
         axial_length: of the helix [um].
         radius: of the helix [um].
         tip_speed: of a node [um/s].
@@ -60,6 +60,8 @@ def turning(scene: Scene, segment_length: float | None = None, together: int = 1
     """
     if segment_length is not None:
         scene = with_values(scene, {"flagella.segment_length": segment_length, "hydrodynamics.pair_radius": None})
+        own = tuple(dataclasses.replace(one, segments=None) for one in scene.flagellum)
+        scene = dataclasses.replace(scene, flagellum=own)
     spec = max(scene.resolved_flagella(), key=lambda own: own.length)
     if spec.segment_count > MOST_SEGMENTS:
         scene, spec = _coarser(scene, spec)
@@ -74,9 +76,22 @@ def turning(scene: Scene, segment_length: float | None = None, together: int = 1
     resistance = flat @ np.linalg.solve(mobility, flat.T) / together
     spin = spec.segment_count / filament_mobility(scene, h).spin  # segments also turn about themselves
     about = resistance[0, 0] + spin * (helix.rise / h) ** 2 - resistance[0, 1] ** 2 / resistance[1, 1]
-    rate = abs(spec.torque) / about
     drag = float(2 * np.pi * about)
-    return Turning(rate / (2 * np.pi), float(x[-1, 2]), helix.radius, rate * helix.radius, drag)
+    rate = _rate(scene, spec, drag)
+    return Turning(rate, float(x[-1, 2]), helix.radius, 2 * np.pi * rate * helix.radius, drag)
+
+
+def _rate(scene: Scene, spec: FlagellumSpec, drag: float) -> float:
+    """Rate at which a motor turns a drag [pN um s] forward [Hz]; that relative to the body is taken as that in the
+    fluid."""
+    if not scene.body.enabled:
+        return 0.0
+    if spec.law == "rate":
+        return abs(spec.rate)
+    held = abs(spec.torque)
+    if spec.law == "constant" or held / drag <= spec.knee:
+        return held / drag
+    return held * spec.no_load / (held + drag * (spec.no_load - spec.knee))
 
 
 def _coarser(scene: Scene, spec: FlagellumSpec) -> tuple[Scene, FlagellumSpec]:
@@ -117,14 +132,15 @@ def _mobility(scene: Scene, spec: FlagellumSpec, x: Array, together: int) -> Arr
 
 
 def mesh_dependence(scene: Scene, finer: float) -> float | None:
-    """Relative change of a stiff flagellum's rate from segments `finer` times as long to the scene's, in a bundle of as
-    many as the scene has; None: not allowed."""
+    """Relative change of a stiff flagellum's rate under a given torque from segments `finer` times as long to the
+    scene's, in a bundle of as many as the scene has; None: not allowed."""
     if max(spec.segment_count for spec in scene.resolved_flagella()) > finer * MOST_SEGMENTS:
         return None
     try:
         specs = scene.resolved_flagella()
-        h, nodes = max(own.segment_length for own in specs), max(own.segment_count for own in specs) / finer + 1
+        h = max(specs, key=lambda own: own.length).segment_length
+        nodes = max(own.segment_count for own in specs) / finer + 1
         together = min(len(specs), max(1, int(_MOST_NODES / nodes)))
-        return turning(scene, None, together).rate / turning(scene, finer * h, together).rate - 1.0
+        return turning(scene, finer * h, together).drag / turning(scene, None, together).drag - 1.0
     except (SceneError, np.linalg.LinAlgError):
         return None
