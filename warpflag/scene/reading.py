@@ -179,6 +179,12 @@ def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
         raise SceneError.joined(told) from None
 
 
+def is_whole(key: str) -> bool:
+    """Whether a dotted key has whole numbers."""
+    setting = _KEYS.get(re.sub(r"^flagellum\.\d+\.", "flagellum.", key))
+    return setting is not None and setting.kind == "integer"
+
+
 def check_key(key: str, value: Any, brief: bool = False) -> None:
     """That scenes have a key.
 

@@ -100,7 +100,7 @@ class Setting:
             SceneError: the value is not allowed.
         """
         value = _plain(value)
-        if self.derived and (value is None or (value == ABSENT and self.kind != "text")):
+        if self.derived and (value is None or value == ABSENT):
             return None
         if self.kind == "vector" and isinstance(value, list | tuple) and len(value) == 3:
             return tuple(float(self._number(key, value, _plain(item))) for item in value)

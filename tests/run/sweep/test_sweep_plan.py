@@ -358,3 +358,37 @@ def test_means_are_of_the_repeats_that_are_done(tmp_path):
     assert float(mean["rates.net_speed"]) == 2.5 and float(mean["rates.net_speed.error"]) == pytest.approx(1.5)
     assert float(mean["events.zipped"]) == 2e-3 and mean["events.zipped.count"] == "1"
     assert mean["events.zipped.error"] == ""
+
+
+def test_ranges_of_whole_numbers_are_whole_where_a_key_is(folder):
+    scene = folder / "base.toml"
+    absent = ["flagella.phase_difference=absent"]
+    assert [m.scene.flagella.count for m in read(scene, absent, ["flagella.count=1:3:3"]).members()] == [1, 2, 3]
+    assert [m.values for m in read(scene, grid=["motor.torque=1:2:2"]).members()][0] == {"motor.torque": 1.0}
+    with pytest.raises(BadMembers, match=r"member 0001: flagella\.count = 1\.5"):
+        read(scene, absent, ["flagella.count=1:2:3"]).members()
+    with pytest.raises(SceneError, match="finite numbers as from and to"):
+        read(scene, grid=["motor.torque=1:inf:3"])
+
+
+def test_what_draws_and_repeats_have_of_their_own(folder):
+    noisy = "repeats = 2\n[set]\nnumerics.time_step = 1e-6\n[random]\nfluid.temperature = { low = 280, high = 300 }\n"
+    seeds = [m.scene.fluid.seed for m in members(folder, noisy + "draws = 2\n")]
+    assert len(set(seeds)) == 4 and seeds[0] == 0
+    with pytest.raises(SceneError, match=r"random\.draws = 3: would be the same run"):
+        members(folder, "[random]\ndraws = 3\n")
+    switching = '[set]\nmotor.switching = "markov"\n[random]\ndraws = 3\n'
+    assert len({m.scene.motor.seed for m in members(folder, switching)}) == 3
+    found = members(folder, '[set]\nstart.frame = -1\n[axes]\nstart.record = ["absent"]\n')
+    assert found[0].scene.start.record is None
+
+
+def test_an_axis_of_frames_keeps_its_values_in_the_table(tmp_path):
+    varied = Sweep(small(), {"frames": [4, 8]}).members()
+    for name in ("0000", "0001"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "summary.json").write_text(json.dumps({"status": "done", "frames": 99, "steps": 3}))
+    table.write(tmp_path, varied, ["0000", "0001"])
+    with open(tmp_path / "table.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["frames"], row["steps"], row["status"]) for row in rows] == [("4", "3", "done"), ("8", "3", "done")]

@@ -51,6 +51,11 @@ class Draws:
             self._anchors = _checked_anchors(self._anchors, base)
 
     @property
+    def differs(self) -> bool:
+        """Whether anything is drawn."""
+        return bool(self._values) or (self._anchors is not None and self._anchors["placement"] == "random")
+
+    @property
     def differs_in_repeats(self) -> bool:
         """Whether the repeats of a point differ."""
         placed = self._anchors is not None and self._anchors["placement"] == "random"
@@ -78,7 +83,7 @@ class Draws:
         if self._anchors is not None:
             for k, (azimuth, offset) in enumerate(self._placed(with_values(scene, values), draw, repeat)):
                 values |= {f"flagellum.{k}.azimuth": azimuth, f"flagellum.{k}.anchor_offset": offset}
-        if scene.fluid.temperature > 0.0 and (draw or repeat):
+        if values.get("fluid.temperature", scene.fluid.temperature) > 0.0 and (draw or repeat):
             values["fluid.seed"] = self._seed_of("fluid.seed", scene.fluid.seed, draw, repeat)
         if scene.motor.switching == "markov" and (draw or repeat):
             values["motor.seed"] = self._seed_of("motor.seed", scene.motor.seed, draw, repeat)

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +36,7 @@ import numpy as np
 from warpflag.run.sweep import draws
 from warpflag.scene import Scene, SceneError, dumps, load, with_values
 from warpflag.scene.errors import MOST_PROBLEMS, written
-from warpflag.scene.reading import check_key
+from warpflag.scene.reading import check_key, is_whole
 from warpflag.scene.scene_file import nearest, read_overrides, read_toml
 
 __all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_axes", "read"]
@@ -140,11 +141,13 @@ class Sweep:
             _check_axis(key, list(values))
         random = draws.Draws(self.random, self.base)
         repeats = self.repeats
-        noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in self.axes
+        noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in {*self.axes, *self.random}
         seeded = noise or "markov" in (self.base.motor.switching, *self.axes.get("motor.switching", ()))
         if repeats > 1 and not random.differs_in_repeats and not seeded:
             problem = "would be the same run again and again: nothing is random in a repeat"
             raise SceneError("repeats", repeats, problem, ["random"])
+        if random.count > 1 and not (random.differs or seeded):
+            raise SceneError("random.draws", random.count, "would be the same run again and again: nothing is drawn")
         size = repeats * random.count * int(np.prod([len(values) for values in self.axes.values()], dtype=float))
         if size > _MOST_MEMBERS:
             raise SceneError("axes", list(self.axes), f"make {size} members; at most {_MOST_MEMBERS} are allowed")
@@ -282,11 +285,15 @@ def _axis(key: str, values: Any) -> list[Any]:
         ends, spacing = [values["from"], values["to"]], values.get("spacing", "linear")
         if spacing not in ("linear", "log"):
             raise SceneError(f"{key}.spacing", spacing, "must be one of linear, log")
-        if all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
-            if spacing == "log" and min(ends) <= 0.0:
-                raise SceneError(key, values, "must have from and to above 0 where spacing is log")
-            spaced = np.geomspace if spacing == "log" else np.linspace
-            return [float(value) for value in spaced(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
+        if not all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
+            raise SceneError(key, values, "must have finite numbers as from and to")
+        if spacing == "log" and min(ends) <= 0.0:
+            raise SceneError(key, values, "must have from and to above 0 where spacing is log")
+        spaced = np.geomspace if spacing == "log" else np.linspace
+        found = [float(value) for value in spaced(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
+        if is_whole(key.removeprefix("axes.")):
+            return [round(value) if math.isclose(value, round(value), rel_tol=1e-12) else value for value in found]
+        return found
     raise SceneError(key, values, "must be a list of values, or { from = , to = , count = }")
 
 

@@ -60,7 +60,9 @@ def _row(member: Any, directory: Path) -> dict[str, Any]:
     summary = summary_of(directory)
     row: dict[str, Any] = {"member": member.number, "point": member.point, "repeat": member.repeat, **member.values}
     row["status"] = status_of(directory)
-    return row | _flat({name: summary[name] for name in _RESULTS if name in summary})
+    results = _flat({name: summary[name] for name in _RESULTS if name in summary})
+    # `frames` as an axis is the scene's number of intervals, and not that of the frames in the record.
+    return row | {name: value for name, value in results.items() if name not in row}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
