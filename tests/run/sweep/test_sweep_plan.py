@@ -364,7 +364,7 @@ def test_ranges_of_whole_numbers_are_whole_where_a_key_is(folder):
     scene = folder / "base.toml"
     absent = ["flagella.phase_difference=absent"]
     assert [m.scene.flagella.count for m in read(scene, absent, ["flagella.count=1:3:3"]).members()] == [1, 2, 3]
-    assert [m.values for m in read(scene, grid=["motor.torque=1:2:2"]).members()][0] == {"motor.torque": 1.0}
+    assert read(scene, grid=["motor.torque=1:2:2"]).members()[0].values == {"motor.torque": 1.0}
     with pytest.raises(BadMembers, match=r"member 0001: flagella\.count = 1\.5"):
         read(scene, absent, ["flagella.count=1:2:3"]).members()
     with pytest.raises(SceneError, match="finite numbers as from and to"):
