@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 __all__ = ["OptionError", "add", "sweep"]
 
 
+# Options of sbatch that the jobs of a sweep depend on, and what sets them.
+_OWN_OF_JOBS = {"array": "--jobs", "time": "--time", "signal": "--time"}
 _LEAST_JOB_SECONDS = 60.0  # Slurm counts minutes, and a worker takes seconds to begin
 
 
@@ -93,6 +95,16 @@ def sweep(options: argparse.Namespace) -> Outcome | str:
         raise OptionError("--resume goes on with the sweep of its directory; leave out -o, --grid and --set")
     if options.resume_or_start and not (options.scene and options.output):
         raise OptionError("--resume-or-start needs a SWEEP.toml and -o DIR")
+    if not (options.slurm or options.slurm_script):
+        for option, value in (("--jobs", options.jobs), ("--time", options.time), ("--slurm-set", options.slurm_set)):
+            if value:
+                raise OptionError(f"{option} is for --slurm or --slurm-script; --max-wall ends a sweep on this machine")
+    for pair in options.slurm_set:
+        key, sign, value = pair.partition("=")
+        if not (key and sign and value) or key.startswith("-"):
+            raise OptionError(f"--slurm-set {pair}: must be written KEY=VALUE, without dashes")
+        if key in _OWN_OF_JOBS:
+            raise OptionError(f"--slurm-set {pair}: {key} is set by {_OWN_OF_JOBS[key]}")
     from warpflag.run.stop import Stop
 
     limits = {} if options.checkpoint_interval is None else {"checkpoint_seconds": options.checkpoint_interval}

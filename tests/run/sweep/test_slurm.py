@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from tests.runs import small
+from warpflag.cli import main
 from warpflag.run import sweep
 from warpflag.run.run_directory import RunError
 from warpflag.run.sweep import Sweep, slurm
+from warpflag.scene import dumps
 
 PAGE = Path(__file__).parents[3] / "docs" / "sweeps.md"
 PATIENT = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(143)); time.sleep(60)"
@@ -34,6 +37,39 @@ def test_shares_of_a_script_cover_every_member(started, tmp_path):
         ended = subprocess.run(["bash"], input=script, text=True, capture_output=True, env=environment, cwd=tmp_path)
         assert ended.returncode == 0, ended.stderr
     assert started.statuses() == ["done"] * 3
+
+
+def test_any_name_of_a_directory_is_kept_whole_in_a_script(tmp_path):
+    """Slurm reads its directives as a shell does, and a per cent sign as the beginning of a job's number."""
+    base = small({"duration": 4e-5, "frames": 4, "flagella.length": 1.0})
+    odd = sweep.start(Sweep(base, {"motor.torque": [1.0, 2.0]}), str(tmp_path / "a 'b'@c %d"))
+    script = slurm.Jobs(odd, 3600.0, count=2, further={"comment": "two words"}).script()
+    place = str(odd.directory.resolve())
+    assert shlex.split(next(line for line in script.splitlines() if "--output" in line))[1:] == [
+        f"--output={place.replace('%', '%%')}/slurm-%A_%a.log"
+    ]
+    assert "#SBATCH --comment='two words'\n" in script
+    (command,) = [line for line in script.splitlines() if "--resume" in line]
+    assert place in shlex.split(command) and shlex.split(command)[-6:-3] == [
+        "--share",
+        "$SLURM_ARRAY_TASK_ID/2",
+        "--quiet",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        (["--slurm-script", "--slurm-set", "array=1-3"], "array is set by --jobs"),
+        (["--slurm-script", "--slurm-set", "exclusive"], "KEY=VALUE"),
+        (["--jobs", "3"], "--jobs is for --slurm"),
+        (["--time", "1:00:00"], "--max-wall"),
+    ],
+)
+def test_options_of_jobs_that_would_be_passed_over_or_break_them_are_refused(given, word, tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text(dumps(small()))
+    assert main(["sweep", str(tmp_path / "scene.toml"), "-o", str(tmp_path / "out"), *given]) == 2
+    assert word in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_members_are_cut_to_fit_the_wall_time(started, monkeypatch):

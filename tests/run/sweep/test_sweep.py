@@ -249,6 +249,9 @@ def test_a_finished_member_of_another_scene_is_refused(tmp_path):
     file.write_text(text.replace("3.0]", "3.0, 3.4]"))  # one more at the end is a longer sweep
     assert sweep.resume(tmp_path / "out").execute(workers=1, quiet=True).status == "done"
     assert [row["motor.torque"] for row in rows(tmp_path / "out")] == ["1.0", "2.0", "3.0", "3.4"]
+    with pytest.raises(RunError, match=r"0003 was a member"):
+        file.write_text(text)  # and one less would leave its run behind
+        sweep.resume(tmp_path / "out")
 
 
 def test_the_summary_of_another_member_is_none(tmp_path):

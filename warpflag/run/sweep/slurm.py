@@ -88,12 +88,13 @@ class Jobs:
             "time": slurm_time(self.seconds),
             "signal": f"B:USR1@{self.notice}",
             "cpus-per-task": str(self.workers or 1),
-            "output": str(directory / "slurm-%A_%a.log"),
+            "output": str(directory).replace("%", "%%") + "/slurm-%A_%a.log",
             "open-mode": "append",
             **self.further,
         }
-        lines = [f"#SBATCH --{name}={value}" for name, value in options.items()]
-        command = shlex.join(self.command("@")).replace("@", f'"$SLURM_ARRAY_TASK_ID/{count}"')
+        lines = [f"#SBATCH --{name}={shlex.quote(value)}" for name, value in options.items()]
+        share = f'--share "$SLURM_ARRAY_TASK_ID/{count}" --quiet'
+        command = shlex.join(self.command("SHARE")).replace("--share SHARE --quiet", share)
         return "\n".join(
             [
                 "#!/bin/bash",

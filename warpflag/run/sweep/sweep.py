@@ -303,14 +303,19 @@ def resume(directory: str | Path) -> SweepRun:
     """The sweep of a directory.
 
     Raises:
-        RunError: there is no sweep.
+        RunError: there is no sweep, or its directory holds more members than it has.
         SceneError: its files can't be read.
     """
     path = Path(directory)
     if not (path / SWEEP_NAME).is_file():
         raise RunError(f"--resume {directory}: holds no sweep, there is no {SWEEP_NAME}")
     sweep = read(path / SWEEP_NAME)
-    return SweepRun(path, sweep, sweep.members())
+    members = sweep.members()
+    beyond = [own.name for own in path.iterdir() if own.name.isdecimal() and int(own.name) >= len(members)]
+    if beyond:
+        problem = f"{path / min(beyond, key=int)} was a member, which {SWEEP_NAME} has no longer"
+        raise RunError(f"--resume {directory}: {problem}; values can only be added at the end of the first axis")
+    return SweepRun(path, sweep, members)
 
 
 def begun_in(directory: Path) -> bool:
