@@ -219,3 +219,30 @@ def test_an_empty_or_missing_table_is_refused(line):
     (line / "table.csv").unlink()
     with pytest.raises(OutputError, match=r"table\.csv: can't be read"):
         sweep_figures.read(line)
+
+
+def test_levels_are_told_apart_and_stand_clear_of_each_other_and_of_the_lines(tmp_path):
+    lengths = [1 + 0.001 * k for k in range(8)]
+    rows = [f"{k},{k},0,{t},{x},done,{k}" for k, (t, x) in enumerate((t, x) for t in (1, 2) for x in lengths)]
+    made = sweep(tmp_path / "a", {"motor.torque": [1, 2], "flagella.length": lengths}, rows, "rates.net_speed")
+    figure = sweep_figures.curves(sweep_figures.read(made))
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"length {x:.4g}" for x in lengths]
+    assert legend.get_window_extent().x0 >= figure.axes[0].get_window_extent().x1
+    drawn = sweep_figures.maps(sweep_figures.read(made)).axes[0].get_yticklabels()
+    assert [text.get_text() for text in drawn] == [f"{x:.4g}" for x in lengths]
+    words = [f"runs/some_long_name/{k}/run.h5" for k in range(6)]
+    rows = [f"{k},{k},0,{word},done,{k}" for k, word in enumerate(words)]
+    made = sweep(tmp_path / "b", {"start.record": words}, rows, "rates.net_speed")
+    ticks = sweep_figures.curves(sweep_figures.read(made)).axes[0].get_xticklabels()
+    assert len({text.get_text() for text in ticks}) == 6 and all(text.get_rotation() == 40 for text in ticks)
+    assert max(len(text.get_text()) for text in ticks) <= 20
+
+
+def test_what_differs_by_round_off_alone_and_what_nobody_has(tmp_path):
+    rows = [f"{k},{k},0,{t},done,{274.01774840 + 1e-9 * k}," for k, t in enumerate((1.0, 2.0))]
+    made = sweep(tmp_path / "made", {"motor.torque": [1.0, 2.0]}, rows, "rates.net_speed,events.zipped")
+    speed, zipped = sweep_figures.curves(sweep_figures.read(made), None, ["net_speed", "zipped"]).axes
+    assert np.ptp(speed.get_ylim()) > 10.0
+    assert [text.get_text() for text in zipped.texts] == ["no member has any"] and not len(zipped.get_yticks())

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Labels", "labels_of"]
+__all__ = ["Labels", "labels_of", "set_levels", "told_apart", "with_error"]
 
 # They label runs only where nothing else differs.
 _WEAK_KEYS = ("name", "duration", "frames", "start.record", "start.frame")
 _LONGEST_LABEL = 48  # letters of a label
+_LONGEST_TICK, _LETTERS_OF_TICKS = 20, 36  # letters of a tick's label, and of all of them side by side
 
 
 class Labels(NamedTuple):
@@ -74,3 +75,44 @@ def _text(value: Any) -> str:
     if value is None:
         return "default"
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def told_apart(texts: Sequence[str]) -> list[str]:
+    """Texts, numbers among them with as few digits, three at least, as tell them apart."""
+    for digits in range(3, 17):
+        short = [_short(text, digits) for text in texts]
+        if len(set(short)) == len(set(texts)):
+            return short
+    return list(texts)
+
+
+def set_levels(axis: Any, texts: Sequence[str], at: Sequence[int] | None = None) -> None:
+    """Labels the places 0, 1, ... of an axis of matplotlib; long texts lose their middle, and many stand aslant.
+
+    Args:
+        axis: x or y axis.
+        texts: of all places.
+        at: places that are labelled; default: all.
+    """
+    at = range(len(texts)) if at is None else at
+    every = told_apart(texts)
+    labels = [every[k] for k in at]
+    if max(map(len, labels), default=0) > _LONGEST_TICK:
+        cut = [f"{text[:6]}…{text[-13:]}" if len(text) > _LONGEST_TICK else text for text in labels]
+        labels = cut if len(set(cut)) == len(cut) else labels
+    axis.set_ticks(at, labels)
+    if axis.axis_name == "x" and sum(map(len, labels)) > _LETTERS_OF_TICKS:
+        for label in axis.get_ticklabels():
+            label.set(rotation=40, horizontalalignment="right", rotation_mode="anchor")
+
+
+def with_error(mean: float, error: float) -> str:
+    """A mean and its standard error, two digits of it."""
+    return f"{mean:.4g} ± {error:.2g}" if not 99.5 <= error < 1e6 else f"{mean:.4g} ± {error:.0f}"
+
+
+def _short(text: str, digits: int) -> str:
+    try:
+        return f"{float(text):.{digits}g}"
+    except ValueError:
+        return text

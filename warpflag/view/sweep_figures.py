@@ -17,6 +17,7 @@ import numpy as np
 from warpflag.base.output import OutputError, missing, text_of_file
 from warpflag.observables.arrays import Array
 from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
+from warpflag.view.labels import set_levels, told_apart, with_error
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["DEFAULT_NUMBERS", "Table", "curves", "figure", "is_sweep", "maps", "read"]
 
 DEFAULT_NUMBERS = ("rates.net_speed", "rates.motor_rate_lab", "rates.body_rate", "events.zipped")
+_MOST_WITHIN = 6  # lines whose legend stands within the first panel
 _BEFORE_NUMBERS = ("member", "point", "repeat", "status", "count")
 # Units of a table's numbers and of a scene's values by the last part of their name, and what one is in that unit.
 _UNITS = {
@@ -241,7 +243,7 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
         panel.set_xlabel(_label(x))
         panel.set_ylabel(_label(name))
         if words:
-            panel.set_xticks(range(len(words)), [_short(word) for word in words])
+            set_levels(panel.xaxis, words)
         elif numbered:
             panel.locator_params(axis="x", integer=True)
         elif _in_equal_ratios(position):
@@ -249,12 +251,17 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
         else:
             panel.ticklabel_format(axis="x", scilimits=(-2, 5), useMathText=True)
         panel.set_xlim(*_with_margin(position, panel.get_xscale() == "log"))
+        _set_height(panel, values[np.isfinite(values)])
         if not table.axes:
             _show_mean(panel, values[np.isfinite(values)])
     if others:
-        handles = [Line2D([], [], marker="o", markersize=3.5, color=COLORS[k % len(COLORS)]) for k in range(len(lines))]
-        labels = [f"{_leaf(others[0])} {_short(line)}".replace("_", " ") for line in lines]
-        panels[0].legend(handles, labels)
+        style: dict[str, Any] = {"marker": "o", "markersize": 3.5, "linestyle": "none" if words or numbered else "-"}
+        handles = [Line2D([], [], color=COLORS[k % len(COLORS)], **style) for k in range(len(lines))]
+        labels = [f"{_leaf(others[0])} {line}".replace("_", " ") for line in told_apart(lines)]
+        if len(lines) > _MOST_WITHIN:
+            figure.legend(handles, labels, loc="outside right upper")
+        else:
+            panels[0].legend(handles, labels)
     _say(figure, _over(table, others[1:]), "hollow: " + "; ".join(notes) if notes else "")
     return figure
 
@@ -271,12 +278,21 @@ def _say(figure: Figure, *notes: str) -> None:
         figure.supxlabel("; ".join(filter(None, notes)), fontsize=7)
 
 
+def _set_height(panel: Axes, values: Array) -> None:
+    """Values that are equal but for round-off are not drawn apart, and a panel without any says so."""
+    if not len(values):
+        panel.set_yticks([])
+        panel.text(0.5, 0.5, "no member has any", transform=panel.transAxes, ha="center", va="center", fontsize=8)
+    elif np.ptp(values) < 1e-6 * (size := float(np.abs(values).max())):
+        panel.set_ylim(values.min() - 0.05 * size, values.max() + 0.05 * size)
+
+
 def _show_mean(panel: Axes, values: Array) -> None:
     """The mean of all members as a line, and above the panel with its standard error."""
     if len(values) > 1:
         error = values.std(ddof=1) / math.sqrt(len(values))
         panel.axhline(values.mean(), color="0.6", linewidth=0.8, zorder=0)
-        panel.set_title(f"{values.mean():.4g} ± {error:.2g}", fontsize=8)
+        panel.set_title(with_error(values.mean(), error), fontsize=8)
 
 
 def _with_margin(position: Array, logarithmic: bool) -> tuple[float, float]:
@@ -324,13 +340,8 @@ def maps(table: Table, numbers: Sequence[str] = ()) -> Figure:
         drawn = panel.imshow(image, origin="lower", aspect="auto", cmap="viridis")
         panel.set_facecolor("0.9")
         panel.figure.colorbar(drawn, ax=panel, label=_label(name))
-        for ticks, labels, levels in (
-            (panel.set_xticks, panel.set_xticklabels, first),
-            (panel.set_yticks, panel.set_yticklabels, second),
-        ):
-            every = max(1, len(levels) // 6)
-            ticks(range(0, len(levels), every))
-            labels([_short(level) for level in levels[::every]])
+        for axis, levels in ((panel.xaxis, first), (panel.yaxis, second)):
+            set_levels(axis, levels, range(0, len(levels), max(1, len(levels) // 6)))
         panel.set_xlabel(_label(table.axes[0]))
         panel.set_ylabel(_label(table.axes[1]))
     _say(figure, _over(table, table.axes[2:]))
@@ -386,10 +397,3 @@ def _label(name: str) -> str:
     )
     unit = _UNITS.get(_leaf(name), ("", 1.0))[0]
     return f"{words} [{unit}]" if unit else words
-
-
-def _short(text: str) -> str:
-    try:
-        return f"{float(text):.3g}"
-    except ValueError:
-        return text
