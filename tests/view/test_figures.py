@@ -236,3 +236,16 @@ def test_command_writes_the_format_of_the_ending_and_refuses_others(made, tmp_pa
     assert cli.main(["plot", str(made.directory), str(made.directory), "--as", "dashboard", "-o", good]) == 2
     with pytest.raises(OutputError, match=r"\.docx"):
         figures.save(figures.dashboard(made.directory), bad)
+
+
+def test_single_frames_are_points_and_a_filament_alone_has_no_motor(tmp_path):
+    scene = small({"frames": 1, "duration": 1e-5})
+    panels = panels_of(figures.dashboard(executed(scene, tmp_path / "two")))
+    (line,) = panels["swimming speed $v$ (µm/s)"].get_lines()
+    assert np.isfinite(line.get_ydata()).sum() == 1 and line.get_marker() == "o"
+    free = {"body.enabled": False, "flagella.count": 1, "flagella.phase_difference": None}
+    alone = executed(with_values(scene, free), tmp_path / "free")
+    assert list(panels_of(figures.dashboard(alone))) == ["swimming speed $v$ (µm/s)", "elastic energy (pN µm)"]
+    pxr = pytest.importorskip("pxr.Usd")
+    stage = pxr.Stage.Open(str(alone / "movie.usdc"))
+    assert not [prim for prim in stage.Traverse() if "Motor_" in prim.GetName()]

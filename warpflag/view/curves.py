@@ -8,6 +8,7 @@ from warpflag.observables import STRAY
 from warpflag.observables.arrays import Array
 from warpflag.observables.recorded import bundle_lengths
 from warpflag.record import Record
+from warpflag.scene import loads
 
 __all__ = ["Curve", "curves"]
 
@@ -24,6 +25,7 @@ _KNOWN = (
     ("body_rate", "body rate", "", "Hz"),
     ("elastic_energy", "elastic energy", "", "pN µm"),
 )
+_WITH_BODY = ("motor_rate", "motor_torque", "motor_drive", "body_rate")
 _FOR_TWO = ("phase_difference", "bundle_length", "steric_force_density")
 
 
@@ -55,13 +57,14 @@ class Curve:
 def curves(record: Record) -> list[Curve]:
     """The known observables that a record has, in a fixed order.
 
-    A cell with one flagellum has no phase difference, bundle or contact force. The bundle length passes over gaps of
-    `observables.STRAY`; the record holds the plain one.
+    A cell with one flagellum has no phase difference, bundle or contact force, a filament without a body no motor. The
+    bundle length passes over gaps of `observables.STRAY`; the record holds the plain one.
     """
     found, measured = [], record.observables
     alone = len(record.first_node) == 2
+    free = alone and not loads(record.scene_text).body.enabled
     for name, words, symbol, unit in _KNOWN:
-        if name not in measured or (alone and name in _FOR_TWO):
+        if name not in measured or (alone and name in _FOR_TWO) or (free and name in _WITH_BODY):
             continue
         values = bundle_lengths(record, gap=STRAY) if name == "bundle_length" else measured[name]
         found.append(Curve(name, words, symbol, unit, values.reshape(len(values), -1)))

@@ -59,6 +59,7 @@ _SHARE_IN_VIEW = 0.99  # of the values of a panel are shown at least: peaks of s
 # A panel shows all values where they reach no further than this times what that share needs, which then fills at least
 # 1/1.6, five eighths, of its height.
 _PEAK = 1.6
+_LONG_WORDS = 20  # letters of a title beside which there is no room for more
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,8 @@ def dashboard(run: Run | str | Path) -> Figure:
                 color = FLAGELLUM_COLORS[k % len(FLAGELLUM_COLORS)] if many else COLORS[0]
                 axes.plot(run.times, line, color=color, linewidth=0.8 if many else None)
             _set_range(axes, [curve])
-            axes.set_title(_title(curve) + (", a line per flagellum" if many else ""), loc="left")
+            each = ", a line per flagellum" if len(curve.words) < _LONG_WORDS else ", each"
+            axes.set_title(_title(curve) + (each if many else ""), loc="left")
         _set_times(panels, [run], (panels[rows - 1], panels[-1]))
         count = len(run.scene.resolved_flagella())
         figure.suptitle(f"{run.label or run.scene.name}: {count} {'flagella' if count > 1 else 'flagellum'}")
@@ -276,7 +278,12 @@ def _set_range(axes: Any, found: Sequence[Curve]) -> None:
     values = np.concatenate([curve.values.ravel() for curve in found])
     values = values[np.isfinite(values)]
     if len(values) == 0:
+        axes.set_yticks([])
+        axes.text(0.5, 0.5, "no frame has it", transform=axes.transAxes, ha="center", va="center", fontsize=7)
         return
+    for line in axes.get_lines():
+        if np.isfinite(line.get_ydata()).sum() == 1:  # a single point joins nothing
+            line.set(marker="o", markersize=3)
     low, high = np.minimum(values.min(), 0.0), np.maximum(values.max(), 0.0)
     tail = 0.5 * (1.0 - _SHARE_IN_VIEW)
     most_low, most_high = np.minimum(np.quantile(values, tail), 0.0), np.maximum(np.quantile(values, 1.0 - tail), 0.0)

@@ -21,8 +21,8 @@ class Motors(NamedTuple):
     """The motors of a cell in body axes, before they have turned.
 
     Attributes:
-        anchors: where each motor stands, from the middle of the body [um], shape [flagellum_count, 3].
-        tripods: e1, e2 and the motor axis m as rows, shape [flagellum_count, 3, 3].
+        anchors: where each motor stands, from the middle of the body [um], shape [motor_count, 3].
+        tripods: e1, e2 and the motor axis m as rows, shape [motor_count, 3, 3].
     """
 
     anchors: Array
@@ -39,7 +39,10 @@ def body_axes(orientation: ArrayLike) -> Array:
 
 
 def motors(record: Record, scene: Scene) -> Motors:
-    """The motors of a record, turned back from its first frame by the motor angle that they have there."""
+    """The motors of a record, turned back from its first frame by the motor angle that they have there; a filament
+    without a body has none."""
+    if not scene.body.enabled:
+        return Motors(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     first = record.first_node[:-1]
     to_body = body_axes(record.body_orientation[0])
     anchors = (record.positions[0][first] - record.body_position[0]) @ to_body.T

@@ -98,7 +98,7 @@ class Cell:
             for translate, orient in self._poses:
                 yield translate, frame, Gf.Vec3d(*self._positions[frame].tolist())
                 yield orient, frame, Gf.Quatd(w, x, y, z)
-            for turn, angle in zip(self._turns, turned[i].tolist(), strict=True):
+            for turn, angle in zip(self._turns, turned[i, : len(self._turns)].tolist(), strict=True):
                 yield turn, frame, angle
         yield from self._flagella_samples(frames, positions, values)
 
