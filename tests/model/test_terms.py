@@ -128,6 +128,22 @@ def test_contact_with_itself_has_kernels_of_its_own_and_only_then(monkeypatch):
         assert not with_self({"steric.self_contact": True, "steric.enabled": False}, by_cells)
 
 
+@pytest.mark.parametrize(
+    "stage, values",
+    [
+        ("body", {"steric.enabled": False}),
+        ("forces", {"motor.bearing_torque": False}),
+        ("mobility", {"hydrodynamics.body_flow": True}),
+        ("first_velocity", {"hydrodynamics.body_flow": True}),
+    ],
+)
+def test_a_kernel_is_not_compiled_again_for_a_switch_that_it_does_not_know(stage, values, monkeypatch):
+    implicit = {"numerics.stepper": "implicit"} if stage == "first_velocity" else {}
+    both = [launches(cell({**implicit, **own}), monkeypatch, bool(implicit)) for own in ({}, values)]
+    modules = [{kernel.module for kernel in found if stage in kernel.module.name.split(".")} for found in both]
+    assert modules[0] == modules[1] != set()
+
+
 @pytest.mark.parametrize("stepper", ["rkc", "euler", "implicit"])
 def test_a_stepper_brings_only_its_own_kernels(stepper, monkeypatch):
     stages = stages_of(launches(cell({"numerics.stepper": stepper}), monkeypatch))

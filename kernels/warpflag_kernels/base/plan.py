@@ -6,7 +6,7 @@ register. A GPU has threads to spare: one for every element, a warp for the pair
 of a cell. A strict build on a CPU takes launches and sums as a GPU does, for comparisons to the last bit.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from warpflag_kernels.base.precision import Precision
@@ -38,6 +38,11 @@ class Flows:
     def variant(self) -> str:
         """Name of the choice, for kernel modules."""
         return "_".join([self.pairs, *["unequal"] * self.unequal, *["body"] * self.body])
+
+    @property
+    def of_nodes(self) -> "Flows":
+        """The flows that nodes cause themselves."""
+        return replace(self, body=False)
 
     @property
     def within(self) -> bool:

@@ -76,6 +76,11 @@ def variant(terms: Sequence[Term]) -> str:
     return "_".join(term.name.replace(" ", "_") for term in terms)
 
 
+def acting(p: Precision, terms: Sequence[Term], *kinds: str) -> tuple[Term, ...]:
+    """Those terms that have a device function of one of these kinds: a kernel that calls no other is theirs alone."""
+    return tuple(term for term in terms if any(hasattr(term.functions(p), kind) for kind in kinds))
+
+
 @functools.cache
 def combined(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
     """The device functions of `Term.functions`, each summed over several terms in their order.

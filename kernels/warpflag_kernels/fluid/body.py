@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from warpflag_kernels.base.precision import Precision
-from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.term import Term, acting, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.fluid import body_flow
 
@@ -154,9 +154,14 @@ def _kernels(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamesp
     return kernels
 
 
+def _kernels_of(model: DeviceModel, terms: tuple[Term, ...]) -> SimpleNamespace:
+    of_body = acting(model.precision, terms, "on_body", "settle")
+    return _kernels(model.precision, of_body, model.switches.flows.body)
+
+
 def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
     """Force [pN] and torque about the body's centre [pN um] of every flagellum on its body, of these terms."""
-    kernel = _kernels(model.precision, terms, model.switches.flows.body).sum_flagella
+    kernel = _kernels_of(model, terms).sum_flagella
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -182,7 +187,7 @@ def move_bodies(model: DeviceModel, state: DeviceState) -> None:
 
 
 def _move(model: DeviceModel, state: DeviceState) -> None:
-    kernel = _kernels(model.precision, model.terms, model.switches.flows.body).move
+    kernel = _kernels_of(model, model.terms).move
     wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -201,6 +206,6 @@ def body_motion(
     if model.switches.flows.body:
         obstruct(model, state, single)
     if any(hasattr(term.functions(model.precision), "settle") for term in terms):
-        kernel = _kernels(model.precision, terms, model.switches.flows.body).settle
+        kernel = _kernels_of(model, terms).settle
         wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
     _move(model, state)

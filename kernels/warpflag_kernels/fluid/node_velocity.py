@@ -149,7 +149,7 @@ def node_velocities(model: DeviceModel, state: DeviceState) -> None:
     """
     plan, device = model.plan, model.device
     flows = model.switches.flows
-    kernels = _kernels(model.precision, plan.pair_precision, flows, plan.pair_sum)
+    kernels = _kernels(model.precision, plan.pair_precision, flows.of_nodes, plan.pair_sum)
     inputs = [model.data, state.data, state.pairs]
     if plan.pair_sum == "symmetric":
         wp.launch(kernels.by_cells, model.cell_count, inputs=inputs, device=device)

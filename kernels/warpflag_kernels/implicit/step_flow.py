@@ -394,7 +394,7 @@ def single_velocities(model: DeviceModel, state: DeviceState, flow: Any) -> None
         flow: the struct `StepFlow`, built for this pose; its forces are overwritten.
     """
     flows = model.switches.flows
-    kernel = _velocity_kernel(model.precision, flows)
+    kernel = _velocity_kernel(model.precision, flows.of_nodes)
     wp.launch(kernel, model.cell_count, inputs=[model.data, flow, state.data], device=model.device)
     if flows.body:
         body_flow.carry(model, state, flow.shell, model.precision.single)

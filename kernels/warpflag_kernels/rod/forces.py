@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpflag_kernels.base.precision import Precision
-from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.term import Term, acting, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 
 
@@ -61,5 +61,6 @@ def total_forces(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]
         model, state: of the batch; what the terms' launches have evaluated is read.
         terms: those that count; default: all of the model.
     """
-    kernel = _kernel(model.precision, model.terms if terms is None else terms)
+    p, terms = model.precision, model.terms if terms is None else terms
+    kernel = _kernel(p, acting(p, terms, "on_first", "on_second", "on_node", "on_spin"))
     wp.launch(kernel, model.element_count, inputs=[model.data, state.data], device=model.device)

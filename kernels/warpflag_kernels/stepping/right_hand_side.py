@@ -15,7 +15,7 @@ import warp as wp
 
 from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
-from warpflag_kernels.base.term import Term, combined, variant
+from warpflag_kernels.base.term import Term, acting, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours
 from warpflag_kernels.fluid import body, node_velocity, rotne_prager, shell_flow
@@ -75,7 +75,7 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: F
     gather, motion = forces.functions(p, terms).gather, body.functions(p, terms, flows.body)
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
-    move_cell = node_velocity.functions(p, pair, flows, pair_sum).move_cell
+    move_cell = node_velocity.functions(p, pair, flows.of_nodes, pair_sum).move_cell
     beads = shell_flow.functions(p, pair, stored=True)
     obstruct, carry = beads.obstruct, beads.carry
     name = "_".join([variant(terms), flows.variant, pair_sum, *["short"] * (pair != p)])
@@ -174,7 +174,9 @@ def launch_with_contacts(
     smooth = tuple(term for term in terms if not term.contact)
     in_one = model.plan.by_cells and not combined(model.precision, smooth).in_cell and not model.switches.flows.body
     if in_one:
-        kernel = _with_contacts(model.precision, smooth, terms, model.touching, model.switches.has("body contact"))
+        p, body_contact = model.precision, model.switches.has("body contact")
+        own = tuple(term for term in terms if term in smooth or acting(p, [term], "on_body", "settle"))
+        kernel = _with_contacts(p, smooth, own, model.touching, body_contact)
         inputs = [model.data, contacts, magnitude, state.data]
         wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
         return
