@@ -135,6 +135,9 @@ def test_a_malformed_scene_is_one_line_and_no_directory(toml, tmp_path, monkeypa
         (["run", "--resume", "nowhere", "--precision", "float32"], ["--resume", "--precision"]),
         (["check", "missing.toml"], ["missing.toml", "no such file"]),
         (["check", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
+        (["compile", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
+        (["sweep", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
+        (["tradeoff", "small.toml", "--device", "tpu"], ["tpu", "cpu"]),
         (["export", "nowhere", "--to", "usd"], ["nowhere", "no such record"]),
         (["export", "nowhere", "--to", "gif"], ["gif", "usd"]),
         (["export", "nowhere", "--to", "usd", "-o", "movie.mp4"], ["nowhere", "no such record"]),
@@ -368,6 +371,16 @@ def test_a_stopped_run_keeps_its_frames(scene, capsys):
     assert said.out == "" and "flagellum" in line and "numerics.time_step" in line and "made" in line
     with Record("made") as record:
         assert record.frame_count >= 1
+    assert cli.main(["check", scene, "--set", *wrong]) == 3
+    assert "stopped at " in capsys.readouterr().err
+
+
+def test_a_run_goes_on_on_the_device_that_is_named(scene, capsys):
+    assert cli.main(["run", scene, "-o", "made", "--quiet"]) == 0
+    longer = ["--set", "duration=8e-5", "--device", "tpu"]
+    assert "tpu" in refused(capsys, "run", "--resume", "made", *longer)
+    Path("made/summary.json").unlink()  # or nothing is left to be computed
+    assert "tpu" in refused(capsys, "run", scene, "--resume-or-start", "-o", "made", "--device", "tpu")
 
 
 def test_a_figure_needs_no_backend_of_the_notebook_it_was_asked_for_in(scene):

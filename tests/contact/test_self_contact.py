@@ -250,5 +250,11 @@ def test_density_leaves_out_segments_within_three_diameters_of_contour():
     def density(x: np.ndarray) -> float:
         return contact.steric_force_density(x, np.array([0, len(x)]), 0.8, 0.06, 1.0, self_contact=True)
 
-    assert density(nodes[:5]) == 0.0
-    assert density(nodes) == pytest.approx(float(contact.steric_force(0.03, 0.8, 0.06)))
+    def load(x: np.ndarray) -> float:  # every contact counts on both sides
+        spacing = np.array([contact.own_spacing(0.06, 0.05)])
+        return float(contact_load(x[None], np.array([0, len(x)]), 0.8, 0.06, spacing).sum())
+
+    assert density(nodes[:5]) == load(nodes[:5]) == 0.0
+    force = float(contact.steric_force(0.03, 0.8, 0.06))
+    assert density(nodes) == pytest.approx(force)
+    assert load(nodes) == pytest.approx(2 * force)

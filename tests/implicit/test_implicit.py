@@ -27,6 +27,23 @@ ACCURACY = 1e-3
 STATE = [field.name for field in dataclasses.fields(CellState)]
 
 
+def test_a_step_collocates_on_the_parabola_that_the_step_before_begins(device):
+    """Its value at the collocation point, over that at the end, of what is zero at begin and end of the step before."""
+    sim = Simulation(cell(implicit()), device=device, capture=False)
+    found, launch = [], sim.stepper.launch_pass
+
+    def watched() -> None:
+        launch()
+        data = sim.stepper.data
+        found.append([values.numpy()[0] for values in (data.ratio, data.theta, data.rho)])
+
+    sim.stepper.launch_pass = watched
+    sim.advance(2e-5)
+    ratio, theta, rho = np.array(found).T
+    assert len(rho) > 5 and (theta < 1.0).sum() > 5 and np.ptp(ratio) > 0.1
+    np.testing.assert_allclose(rho, theta * (1.0 + theta * ratio) / (1.0 + ratio), rtol=1e-12)
+
+
 def rkc(step: float) -> dict[str, Any]:
     return {"numerics.stepper": "rkc", "numerics.time_step": step}
 

@@ -189,6 +189,19 @@ def test_a_hook_stiffens_by_the_torque_of_the_law_and_a_stopped_run_goes_on_with
     assert np.array_equal(second.state.positions, whole.state.positions)
 
 
+def test_a_member_of_a_batch_has_the_hook_and_the_motors_of_its_own_scene(device):
+    law = {"motor.law": "torque_speed", "numerics.stepper": "implicit", **HOOK}
+    first = {"motor.torque": 1.26, "motor.knee": 50.0, "motor.no_load": 200.0, "hook.stiffening_torque": 0.5}
+    other = {"motor.torque": 1.0, "motor.knee": 20.0, "motor.no_load": 90.0, "hook.stiffening_torque": 0.1}
+    scenes = [cell({**law, **first}), cell({**law, **other, "hook.stiffness": 0.4, "hook.length": 0.08})]
+    batch = Simulation(scenes, device=device, strict=True)
+    batch.advance(1e-4)
+    for c, scene in enumerate(scenes):
+        alone = Simulation(scene, device=device, strict=True)
+        alone.advance(1e-4)
+        assert np.array_equal(batch.cell_state(c).positions, alone.state.positions)
+
+
 def test_nonsense_is_refused_by_name():
     for values, key in (
         ({"hook.stiffness": 1.0, "motor.bearing_torque": False}, "hook.stiffness"),

@@ -56,6 +56,15 @@ def test_markov_switching_has_its_rates_whatever_the_coupling(coupling):
         assert bias**2 * 1.3 < together / 200 < bias
 
 
+@pytest.mark.parametrize("coupling", [0.0, 1.0])
+def test_both_directions_have_clocks_of_their_own(coupling):
+    """Also at equal rates, at which ticks of a clock for both would undo each other."""
+    values = {"motor.to_reverse": 50.0, "motor.to_forward": 50.0, "motor.coupling": coupling, "duration": 10.0}
+    times = [0.0, *switch_times(cell({**MARKOV, **values}), 1)]
+    for begin in (0, 1):
+        assert np.diff(times)[begin::2].mean() == pytest.approx(1 / 50.0, rel=0.15)
+
+
 def test_a_motor_switches_the_same_in_any_cell_and_to_any_end():
     """Of seed and number of the motor alone: neither the duration nor the other motors change its times."""
     scene = cell({**MARKOV, "duration": 2.0})

@@ -243,6 +243,17 @@ def test_opposite_contacts_cancel_in_the_net_rule_only():
     assert values["nodes"] == pytest.approx(one)
 
 
+def test_forces_on_the_nodes_of_both_flagella_are_those_of_levers():
+    """A single segment, pressed from above at a quarter and from below at three quarters by the middles of two others.
+
+    Its nodes feel 3/4 - 1/4 of a force each, to either side; those of the others half a force.
+    """
+    far = np.array([[0.25, -2, 0.038], [0.25, 2, 0.038], [0.75, 2, -0.038], [0.75, -2, -0.038]])
+    for shape in (joined(far, line(2, h=1.0)[:, [2, 1, 0]]), joined(line(2, h=1.0)[:, [2, 1, 0]], far)):
+        nodes = observables.steric_force_density(*shape, **LAW, rule="nodes")
+        assert nodes == pytest.approx((4 * 0.5 + 2 * 0.5) / 2 * force_at(0.038) / 6.0)
+
+
 @pytest.mark.parametrize(("rule", "share"), [("pairs", 2.0), ("nodes", 2 / 3), ("net", 2 / 3)])
 def test_a_line_between_two_is_pressed_by_none(rule, share):
     """Three lines in a row, crossing pairs only at the middle ones: forces on the middle line cancel."""

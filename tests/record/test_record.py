@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py  # noqa: TID253 (no command line starts here)
 import numpy as np
@@ -11,6 +13,9 @@ import pytest
 
 from tests.record.frames import ENTRIES, FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.record import Record, RecordError
+from warpflag.view import sweep_figures
+from warpflag.view.curves import curves
+from warpflag.view.sweep_figures import Table
 
 
 def test_what_is_written_is_what_is_read(tmp_path):
@@ -64,6 +69,24 @@ def test_file_has_units_and_scales(tmp_path):
         assert units["observables/motor_rate"] == "Hz" and units["observables/bundle_length"] is None
         position = file["particles/flagella/position/value"].attrs
         assert position["units"] == "um" and "unit" not in position  # MDAnalysis does not know um
+
+
+def test_every_observable_has_its_unit(tmp_path):
+    units = {"phase_difference": "", "bundle_length": "", "steric_force_density": "pN um-1", "elastic_energy": "pN um"}
+    units |= {"body_speed": "um s-1", "body_rate": "Hz", "motor_rate": "Hz", "motor_torque": "pN um"}
+    recorder = started(tmp_path / "run.h5")
+    recorder.write(replace(frame(0), observables=dict.fromkeys(units, 1.0)))
+    recorder.close()
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert {name: own["value"].attrs.get("unit", "") for name, own in file["observables"].items()} == units
+    # Figures say the same, each from a table of its own.
+    words = {"pN um-1": "pN/µm", "pN um": "pN µm", "um s-1": "µm/s"}
+    units = {name: words.get(unit, unit) for name, unit in units.items() if name != "bundle_length"}
+    curved = curves(SimpleNamespace(observables=dict.fromkeys(units, np.ones(2)), first_node=FIRST_NODE))
+    assert {curve.name: curve.unit for curve in curved} == units
+    table = Table("swept", (), {"member": ["0"], **{f"observables.{name}": ["1.0"] for name in units}})
+    labels = [axes.get_ylabel() for axes in sweep_figures.curves(table, numbers=list(units)).axes]
+    assert labels == [name.replace("_", " ") + (f" [{unit}]" if unit else "") for name, unit in units.items()]
 
 
 def test_other_readers_open_a_record_that_was_read(tmp_path):

@@ -17,7 +17,7 @@ import pytest
 
 from tests.record.frames import FIRST_NODE, SCENE, assert_holds_frames, frame, started, written
 from warpflag.base.output import DiskError
-from warpflag.record import Record, RecordError, new_record
+from warpflag.record import FrameRows, Record, RecordError, new_record
 from warpflag.record.layout import E1, POSITION
 from warpflag.record.recorder import Recorder
 
@@ -186,6 +186,24 @@ def test_a_record_takes_no_frame_twice_and_none_of_before(tmp_path, closed):
             recorder.write(frame(index))
     with pytest.raises(ValueError, match="does not come after"):
         recorder.write(dataclasses.replace(frame(4), time=float("nan")))
+    recorder.write(frame(4))
+    recorder.close()
+    with Record(tmp_path) as record:
+        assert_holds_frames(record, range(5))
+
+
+def test_a_frame_comes_after_all_that_were_given_together(tmp_path):
+    """They wait for a block to be full."""
+    several = [FrameRows.of(frame(index)) for index in range(4)]
+    names = [field.name for field in dataclasses.fields(FrameRows) if field.name not in ("observables", "forms")]
+    rows = FrameRows(
+        **{name: np.concatenate([getattr(one, name) for one in several]) for name in names},
+        observables={n: np.concatenate([one.observables[n] for one in several]) for n in several[0].observables},
+    )
+    recorder = started(tmp_path / "run.h5", block_frames=8, keep_open=False)
+    recorder.write_rows(rows)
+    with pytest.raises(ValueError, match="does not come after the last frame"):
+        recorder.write(frame(2))
     recorder.write(frame(4))
     recorder.close()
     with Record(tmp_path) as record:

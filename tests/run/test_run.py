@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from warpflag_kernels.stepping.health import Fault
 
-from tests.runs import arrays, executed, frame_by_frame, small, summary
+from tests.runs import arrays, ended_at, executed, frame_by_frame, small, summary
 from warpflag import observables
 from warpflag.record import Record
 from warpflag.run import run
@@ -86,6 +86,8 @@ def test_a_violated_guard_keeps_the_sound_frames(tmp_path):
         assert said["frames"] == record.frame_count >= 4
         sound = executed(scene, tmp_path / "sound")
         np.testing.assert_array_equal(record.positions[:4], arrays(sound)["positions"][:4])
+    # What was stopped is followed, to tell whether its motion is to blame.
+    assert said["growth"] is not None and summary(sound)["growth"] is None
 
 
 def test_likely_causes_are_told_the_farthest_from_usual_first():
@@ -112,3 +114,10 @@ def test_likely_causes_are_told_the_farthest_from_usual_first():
 def test_the_summary_tells_whether_steps_were_asked_for_their_balance(stepper, judged, tmp_path):
     scene = small({"numerics.stepper": stepper, "duration": 1e-5, "frames": 1})
     assert summary(executed(scene, tmp_path / "made"))["balance"] == {"judged": judged, "violations": 0}
+
+
+def test_the_last_line_says_how_far_a_run_came(tmp_path):
+    done = run.start(small(), str(tmp_path / "done"), "cpu").execute(quiet=True).message
+    assert done.startswith("small: 9 frames to 0.08 ms in ") and done.endswith(f": {tmp_path / 'done'}")
+    half = ended_at(run.start(small(), str(tmp_path / "half"), "cpu"), 3).message
+    assert half.startswith("small: interrupted, 3 frames to 0.02 ms kept; movie left out; resumable with --resume ")

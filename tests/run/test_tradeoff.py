@@ -56,6 +56,8 @@ def test_the_table_has_every_point_beside_its_reference(studied):
         assert np.isnan(error["h 0.1"]) and np.isnan(error["reference"])
         off = {row["choice"]: float(row["speed_off"]) for row in rows if row["window"] == window}
         assert off["h 0.1"] == 0.0 != off["reference"]
+    first = points.load(directory / "points" / "0000.npz")
+    assert (first.window, first.choice) == ("late", "reference")  # what lasts longest of a run is known first
     assert (directory / "tradeoff.png").stat().st_size > 1000
     for level in ("draft", "standard", "careful"):
         assert f"# {level}: " in said

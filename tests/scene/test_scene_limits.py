@@ -162,6 +162,19 @@ def test_problems_between_settings_are_told_at_once():
     assert keys == ["numerics.time_step", "start.frame", "flagella.phase_difference"]
 
 
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"duration": 1e-5, "numerics.time_step": 1e-5},
+        {"body.width": 2.0, "body.length": 2.0},
+        {"body.length": 2.5, "flagella.anchor_offset": 1.25, "flagella.count": 1},
+        {"polymorphs.enabled": True, "polymorphs.propagation": 0.5, "polymorphs.propagation_back": 0.5},
+    ],
+)
+def test_what_must_not_be_above_a_limit_may_be_equal_to_it(values):
+    with_values(paper_scene("a"), values)
+
+
 def test_of_very_many_problems_the_first_are_told_and_the_rest_counted(path):
     path.write_text("".join(f"k{i} = 1\n" for i in range(1000)) + "[motor]\ntorque = 1e9\naxis_angle = -1\n")
     with pytest.raises(SceneError) as caught:

@@ -301,14 +301,17 @@ def test_crossings_are_those_of_dense_sampling(looked_at, device, precision):
 
 
 @pytest.mark.parametrize("listed_at", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize(("h", "above", "below"), [(0.2, 0.01, 0.01), (0.2, 0.45, 0.45), (0.05, 0.005, 0.195)])
-def test_crossings_are_seen_wherever_the_lists_were_built(h, above, below, listed_at, device, precision):
+@pytest.mark.parametrize(
+    ("h", "count", "above", "below"),
+    [(0.2, 2, 0.01, 0.01), (0.2, 2, 0.45, 0.45), (0.05, 2, 0.005, 0.195), (0.05, 16, 0.1, 0.6)],
+)
+def test_crossings_are_seen_wherever_the_lists_were_built(h, count, above, below, listed_at, device, precision):
     """Two filaments across each other, one of which moves through the other from beyond the reach of the lists, too,
-    or on by many of its short segments."""
-    lengths = {"flagella.length": 2 * h, "flagella.segment_length": h}
+    or on by many of its short segments; they meet in the middle of many, too."""
+    lengths = {"flagella.length": count * h, "flagella.segment_length": h}
     for aside, expected in ((0.0, True), (0.6, False)):
         sim = Simulation(cell({**lengths, "numerics.stepper": "implicit"}, precision), device=device)
-        along = h * (np.arange(3.0) - 0.6)[:, None]
+        along = h * (np.arange(count + 1.0) - count // 2 - (0.3 if count > 2 else -0.4))[:, None]
         still, moving = along * [1.0, 0.0, 0.0], along * [0.1, 1.0, 0.0] + [aside, 0.0, 0.0]
         before, after = (np.array([[still, np.add(moving, [0.0, 0.0, z])]]) for z in (above, -below))
         place(sim, before + listed_at * (after - before))

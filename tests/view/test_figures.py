@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,19 @@ def test_a_dashboard_draws_everything_known_of_a_run(tmp_path):
     energy = figures.read(directory).curves["elastic_energy"].values[:, 0]
     assert panels["elastic energy (pN µm)"].get_lines()[0].get_ydata() == pytest.approx(energy)
     assert all(axes.get_ylim()[0] <= 0.0 for axes in panels.values())
+    (compared,) = figures.comparison([directory], ["motor_rate"]).axes
+    mean = figures.read(directory).curves["motor_rate"].values.mean(axis=1)
+    np.testing.assert_array_equal(compared.get_lines()[0].get_ydata(), mean)  # of what each flagellum has by itself
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_runs_of_unequal_length_are_compared_to_the_end_of_the_longest(order, tmp_path):
+    made_record(tmp_path, 12).close()
+    whole = figures.read(tmp_path)
+    curves_of_part = {name: replace(curve, values=curve.values[:5]) for name, curve in whole.curves.items()}
+    part = replace(whole, label="part", times=whole.times[:5], curves=curves_of_part)
+    (axes,) = figures.comparison([whole, part][::order], ["motor_rate"]).axes
+    assert axes.get_xlim() == (whole.times[0], whole.times[-1])
 
 
 def test_one_flagellum_has_a_dashboard_without_a_bundle(tmp_path):

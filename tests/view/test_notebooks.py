@@ -44,6 +44,8 @@ def test_xarray_has_names_units_and_the_record_s_numbers(tmp_path):
         np.testing.assert_array_equal(data["position"], record.positions[:])
         np.testing.assert_array_equal(data["motor_rate"].sel(flagellum=1), record.observables["motor_rate"][:, 1])
     assert data["position"].dims == ("time", "node", "axis") and data["position"].attrs["units"] == "um"
+    found = {name: data[name].attrs["units"] for name in ("motor_angle", "motor_rate", "bundle_length")}
+    assert found == {"motor_angle": "rad", "motor_rate": "Hz", "bundle_length": ""}
     assert data["time"].attrs["units"] == "s" and list(data["axis"].values) == ["x", "y", "z"]
     of_second = data["position"].where(data["flagellum_of_node"] == 1, drop=True)
     assert of_second.sizes["node"] == FIRST_NODE[2] - FIRST_NODE[1]

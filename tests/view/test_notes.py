@@ -98,6 +98,15 @@ def test_a_legend_says_what_colours_mean(run, tmp_path):
     assert (np.ptp(corners[0], axis=2) > 90).sum() > 100 and (np.ptp(corners[1], axis=2) > 90).sum() == 0
 
 
+@pytest.mark.parametrize("highest", [1.0, 2.6, 8.0])
+def test_a_legend_ends_with_the_value_of_the_last_colour(highest):
+    pen = Pen(np.full((540, 960, 3), 245, np.uint8), LETTER)
+    pen.write_legend(1.0, "curvature", highest)
+    found = ink(pen.picture)[505:530, 150:]  # beyond the colours
+    alike = {value: likeness(found, f"{value:g}", 0.75 * LETTER / 0.73) for value in (1.0, 2.6, 8.0)}
+    assert max(alike, key=alike.__getitem__) == highest
+
+
 def test_every_letter_that_is_written_is_in_the_font():
     shapes = {letter: written(letter, 30) for letter in "0123456789.-µmsxkpNceurvatd/fl"}
     assert len({(shape.shape, shape.tobytes()) for shape in shapes.values()}) == len(shapes)

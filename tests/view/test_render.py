@@ -94,13 +94,16 @@ def test_a_sheet_has_every_snapshot(run, tmp_path, count, size):
     assert sheet.shape == (size[1], size[0], 3)
     columns = {6: 3, 2: 2, 5: 1}[count]
     rows = -(-count // columns)
-    times = set()
+    times, barred = set(), []
     for i in range(count):
         row, column = divmod(i, columns)
         panel = sheet[row * size[1] // rows :, column * size[0] // columns :][: size[1] // rows, : size[0] // columns]
         assert (np.ptp(panel, axis=2) > 50).sum() > 20, i
-        times.add(ink(panel.astype(np.uint8))[:30, :60].tobytes())
+        dark = ink(panel.astype(np.uint8))
+        times.add(dark[:30, :60].tobytes())
+        barred.append(bool((dark[-20:, -40:].sum(axis=1) > 5).any()))
     assert len(times) == count
+    assert barred == [False] * (count - 1) + [True]  # all have one scale
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
@@ -113,7 +116,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
         (run, "p.gif", {"frames_per_second": 0.0}, "frames per second"),
         (run, "p.gif", {"snapshots": 3}, "for pictures"),
         (run, "p.png", {"snapshots": 0}, "snapshots 0"),
-        *((run, "p.png", {"times": [1e-4, t]}, "the movie has 0 to") for t in (math.nan, math.inf, -1e-6, 1e6)),
+        *((run, "p.png", {"times": [1e-4, t]}, "the movie has 0 to 0.55 ms") for t in (math.nan, math.inf, -1e-6, 1e6)),
         (run, "p.png", {"snapshots": 900, "size": (64, 64)}, "do not fit"),
         (run / "movie.usdc", "p.png", {"shot": Shot()}, "movie.usdc"),
         (tmp_path / "junk.usdc", "p.png", {}, "junk.usdc"),
@@ -147,6 +150,13 @@ def test_the_command_draws(run, tmp_path, capsys, monkeypatch):
     )
     assert Path("two.png").read_bytes() == Path("expected.png").read_bytes()
     assert capsys.readouterr() == ("", "")
+    assert cli.main(["render", str(run), "-o", "sheet.png", "--snapshots", "3", "--quiet", *small]) == 0
+    render(run, "expected.png", size=(160, 90), snapshots=3)
+    assert Path("sheet.png").read_bytes() == Path("expected.png").read_bytes()
+    film = ["--fps", "10", "--slow-down", "4000", "--quiet", "--size", "64x36"]
+    assert cli.main(["render", str(run), "-o", "film.gif", *film]) == 0
+    render(run, "expected.gif", size=(64, 36), frames_per_second=10.0, shot=Shot(slow_down=4000.0))
+    assert Path("film.gif").read_bytes() == Path("expected.gif").read_bytes()
     for wrong, word in (
         (["-o", "p.tiff"], ".png"),
         (["-o", "p.png", "--device", "tpu"], "tpu"),

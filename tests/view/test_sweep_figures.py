@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 
 import numpy as np
@@ -130,6 +131,14 @@ def test_without_an_axis_members_are_drawn_with_their_mean(tmp_path):
 
 def test_nothing_is_hollow_where_no_member_zips(grid):
     assert sweep_figures.curves(sweep_figures.read(grid), numbers=["net_speed"]).get_supxlabel() == ""
+
+
+def test_two_axes_make_a_map_where_both_have_three_values(grid, tmp_path):
+    axes = {"motor.torque": [1, 2, 3], "hydrodynamics.mode": ["none", "all"]}
+    rows = [f"{k},{k},0,{t},{m},done,{k}" for k, (t, m) in enumerate(itertools.product(*axes.values()))]
+    few = sweep_figures.figure([sweep(tmp_path / "few", axes, rows, "rates.net_speed")])
+    assert not few.axes[0].images and len(few.axes[0].containers) == 2  # a line for each of two
+    assert sweep_figures.figure([grid]).axes[0].images
 
 
 def test_a_map_has_its_axes_in_order(grid):

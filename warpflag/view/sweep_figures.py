@@ -44,6 +44,7 @@ _UNITS = {
     "viscosity": ("pN s/µm²", 1.0),
     "length": ("µm", 1.0),
     "anchor_offset": ("µm", 1.0),
+    "motor_torque": ("pN µm", 1.0),
     "elastic_energy": ("pN µm", 1.0),
     "steric_force_density": ("pN/µm", 1.0),
     "wall_time": ("s", 1.0),

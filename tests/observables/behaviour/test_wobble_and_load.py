@@ -51,6 +51,16 @@ def test_a_direction_that_turns_counts_from_itself():
     assert found.nutation < 1e-9
 
 
+def test_a_direction_that_sweeps_far_from_frame_to_frame():
+    """20 degrees a frame, which is its minimal rotation, and the axis turns by 40 about it."""
+    frames = np.arange(12)
+    swept = [rotation([0.0, np.radians(20.0 * k), 0.0]) for k in frames]
+    phase = np.radians(40.0 * frames)
+    cone = np.stack([np.sin(0.3) * np.cos(phase), np.sin(0.3) * np.sin(phase), np.cos(0.3) + 0 * phase], axis=1)
+    found = wobble(1e-3 * frames, [r @ v for r, v in zip(swept, cone, strict=True)], [r[:, 2] for r in swept])
+    assert found.precession_rate == pytest.approx(40.0 / 360.0 / 1e-3, rel=1e-6)
+
+
 def test_a_window_of_one_frame_is_refused():
     with pytest.raises(ValueError, match="two frames"):
         wobble([0.0], [[0, 0, 1]], [0, 0, 1])

@@ -72,6 +72,20 @@ def test_options_of_jobs_that_would_be_passed_over_or_break_them_are_refused(giv
     assert word in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+def test_a_job_runs_with_what_was_said_of_it(tmp_path, capsys):
+    scene, out = tmp_path / "cell.toml", tmp_path / "out"
+    scene.write_text("format = 1\nduration = 4e-5\nframes = 4\n")
+    plan = ["sweep", str(scene), "--grid", "motor.torque=1,2", "-o", str(out), "--slurm-script", "--jobs", "2"]
+    assert main([*plan, "--time", "90:00", "--workers", "3", "--device", "cuda:1", "--movies"]) == 0
+    script = capsys.readouterr().out
+    (line,) = (line for line in script.splitlines() if " -m warpflag " in line)
+    assert f" sweep --resume {out} --share " in line
+    assert line.endswith(" --quiet --workers 3 --device cuda:1 --movies &")
+    assert "#SBATCH --cpus-per-task=3\n" in script and "#SBATCH --time=01:30:00\n" in script
+    assert main(["sweep", "--resume", str(out), "--slurm-script", "--jobs", "1"]) == 0
+    assert " --quiet --workers 1 &\n" in capsys.readouterr().out
+
+
 def test_members_are_cut_to_fit_the_wall_time(started, monkeypatch):
     monkeypatch.setattr(type(started), "seconds_per_member", lambda *_: 100.0)
     assert slurm.Jobs(started, 100.0).jobs() == 3

@@ -298,8 +298,9 @@ def test_shares_and_workers_that_there_are_not(tmp_path, options):
 def test_shares_complete_each_other(tmp_path):
     plan = Sweep(small(BASE), {"motor.torque": TORQUES})
     started = sweep.start(plan, str(tmp_path / "out"))
-    assert started.execute(workers=1, quiet=True, share=(0, 2)).status == "done"
+    assert started.execute(workers=1, quiet=True, share=(0, 2), movies=True).status == "done"
     assert started.statuses() == ["done", "missing", "done"]
+    assert len(list((tmp_path / "out").glob("*/movie.usdc"))) == 2
     assert started.execute(workers=1, quiet=True, share=(1, 2)).status == "done"
     assert started.statuses() == ["done"] * 3
 

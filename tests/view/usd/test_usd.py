@@ -73,10 +73,10 @@ def test_stage_says_its_units_times_and_origin(movie):
 
 def test_film_rates(movie):
     record, _ = movie
-    stage = movie_stage(record, Shot(slow_down=1000.0, frames_per_second=24.0))
-    assert stage.GetTimeCodesPerSecond() == pytest.approx(20.0)  # 1 ms of the cell, 20 frames, in 1 s
+    stage = movie_stage(record, Shot(slow_down=500.0, frames_per_second=24.0))
+    assert stage.GetTimeCodesPerSecond() == pytest.approx(40.0)  # 1 ms of the cell, 20 frames, in 0.5 s
     assert stage.GetFramesPerSecond() == 24.0
-    assert stage.GetRootLayer().customLayerData["warpflag"]["slowDown"] == pytest.approx(1000.0)
+    assert stage.GetRootLayer().customLayerData["warpflag"]["slowDown"] == pytest.approx(500.0)
     assert stage.GetEndTimeCode() == 11.0
 
 

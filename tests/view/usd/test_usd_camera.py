@@ -10,7 +10,7 @@ from tests.films import made_record
 from tests.view.usd.stages import at, faults
 from warpflag.scene import paper_scene, with_values
 from warpflag.view.usd import Shot, movie_stage, write_movie
-from warpflag.view.usd.camera import steady_path
+from warpflag.view.usd.camera import Extent, steady_path, view_axes
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,17 @@ def test_camera_frames_the_whole_path(movie):
     record, stage = movie
     assert_camera_sees_all(record, stage)
     assert UsdGeom.Xformable(at(stage, "/World/Camera")).GetTimeSamples() == []
+
+
+def test_spheres_reach_as_far_as_their_surfaces():
+    """Seen at half the angle of view, the edge of a sphere is beyond the one that faces that side."""
+    directions = np.random.default_rng(1).standard_normal((1, 20000, 3))
+    surface = directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    view = view_axes(np.array([0.0, 0.0, 0.0, 1.0]))
+    ball, points = (Extent(view, np.zeros((1, 3))) for _ in range(2))
+    ball.add(slice(0, 1), np.zeros((1, 1, 3)), 1.0)
+    points.add(slice(0, 1), surface, 0.0)
+    np.testing.assert_allclose(points.reach, ball.reach, rtol=2e-3)
 
 
 def test_camera_follows_the_cell(tmp_path):

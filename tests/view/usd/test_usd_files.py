@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom  # noqa: TID253 (no command line starts here)
+from pxr import Sdf, Usd, UsdGeom  # noqa: TID253 (no command line starts here)
 
 from tests.films import FIRST_NODE, THREE, made_record
 from tests.view.usd.stages import at, faults
@@ -31,6 +31,8 @@ def test_value_clips_play_as_one_file_does(tmp_path):
         write_movie(record, path, shot)
     clips = sorted(tmp_path.glob("movie.usdc.clips/*.usdc"))
     assert len(clips) == 4 and "manifest" in clips[-1].name  # 5 + 5 + 2 frames
+    samples = [Sdf.Layer.FindOrOpen(str(clip)).ListAllTimeSamples() for clip in clips]
+    assert samples == [[*range(6)], [*range(5, 11)], [10, 11], []]  # with the first of the next one
     stage = Usd.Stage.Open(str(path))
     assert problems(stage) == []
     for prim in whole.Traverse():
