@@ -69,6 +69,8 @@ def test_rates_of_unequal_intervals_are_weighted_with_them():
     assert digest(made, small())["rates"]["body_rate"] == pytest.approx(5.0)
     made.times = 1e-3 * np.array([0.0, 0.5, 2.0, 2.1, 3.0])
     assert digest(made, small())["rates"]["body_rate"] == pytest.approx(0.1 * 2.0 + 0.9 * 8.0)
+    free = {"body.enabled": False, "flagella.count": 1, "flagella.phase_difference": None}
+    assert not [name for name in digest(made, small(free))["rates"] if "motor" in name]
 
 
 def test_last_observables_and_counts():

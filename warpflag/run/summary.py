@@ -36,9 +36,10 @@ def digest(record: Record, scene: Scene, kept: Mapping[str, np.ndarray] | None =
 
     Returns:
         `time` [s] and number of `frames`; `observables` by name; `rates`: `motor_rate` relative to the body and
-        `motor_rate_lab` [Hz], shape [flagellum_count], `body_rate` about the rearward axis [Hz] and `net_speed`,
-        displacement over time [um/s], None where the window is a single frame; `events`: time of the first frame that
-        is `synchronised` and that is `zipped` [s], None where there is none; where the scene asks for it, `behaviour`
+        `motor_rate_lab` [Hz], shape [flagellum_count], both only with a body, `body_rate` about the rearward axis [Hz]
+        and `net_speed`, displacement over time [um/s], None where the window is a single frame; `events`: time of the
+        first frame that is `synchronised` and that is `zipped` [s], None where there is none; where the scene asks for
+        it, `behaviour`
         (see `warpflag.observables.behaviour.of_record.digest`).
     """
     entries = _read(record) if kept is None else kept
@@ -122,11 +123,15 @@ def _rates(
         return None
     window = times[first:]
     angles, orientations = entries[MOTOR_ANGLE][first:], entries[BODY_ORIENTATION][first:]
+    axes = observables.motor_axes(scene)
+    motors = {
+        "motor_rate": observables.motor_rate(window, angles),
+        "motor_rate_lab": observables.lab_motor_rate(window, angles, orientations, axes),
+    }
     return {
         "from": window[0],
         "to": window[-1],
-        "motor_rate": observables.motor_rate(window, angles),
-        "motor_rate_lab": observables.lab_motor_rate(window, angles, orientations, observables.motor_axes(scene)),
+        **(motors if scene.body.enabled else {}),  # a filament without a body has none
         # Each frame's rate is that of the interval before it, from the accumulated angle.
         "body_rate": np.average(measured["body_rate"][first + 1 :], weights=np.diff(window)),
         "net_speed": observables.net_speed(window, entries[BODY_POSITION][first:]),
