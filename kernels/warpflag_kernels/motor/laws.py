@@ -34,6 +34,9 @@ from warpflag_kernels.fluid import body
 # Newton steps for the body's angular velocity. A tripod has so little drag that the body's rotation hardly changes its
 # motor's torque: two steps converge, a third is needed where a motor changes its piece.
 MOTOR_ITERATIONS = 8
+# A corner of a drive that is this near [s] has been reached: far above the round-off of a time of seconds, far below
+# the shortest step.
+AT_ONCE = 1.0e-13
 
 
 class Law(IntEnum):
@@ -55,6 +58,7 @@ def curves(p: Precision) -> SimpleNamespace:
     module = p.module("motor_curves")
     zero = wp.constant(real(0.0))
     one = wp.constant(real(1.0))
+    at_once = wp.constant(wp.float64(AT_ONCE))
     prescribed = wp.constant(wp.int32(Law.PRESCRIBED))
 
     @wp.func(module=module)
@@ -76,6 +80,27 @@ def curves(p: Precision) -> SimpleNamespace:
         span = law.switch_time[high] - law.switch_time[low]
         share = real((time - law.switch_time[low]) / span)
         return law.switch_drive[low] + share * (law.switch_drive[high] - law.switch_drive[low])
+
+    @wp.func(module=module)
+    def next_kink(model: Model, c: wp.int32, time: wp.float64, target: wp.float64):
+        """First time after `time` at which the drive of a motor of cell c has a corner, or target before that [s]."""
+        law = model.motor_law[0]
+        found = target
+        after = time + at_once
+        k = model.first_flagellum[c]
+        while k < model.first_flagellum[c + 1]:
+            low = law.first_switch[k]
+            high = law.first_switch[k + 1]
+            while low < high:  # the first corner after that time
+                middle = (low + high) / 2
+                if law.switch_time[middle] <= after:
+                    low = middle + 1
+                else:
+                    high = middle
+            if low < law.first_switch[k + 1]:
+                found = wp.min(found, law.switch_time[low])
+            k += 1
+        return found
 
     @wp.func(module=module)
     def sense(model: Model, k: wp.int32, drive: real):
@@ -128,7 +153,7 @@ def curves(p: Precision) -> SimpleNamespace:
             k += 1
         return bound
 
-    return SimpleNamespace(drive_at=drive_at, settled=settled, twist_bound=twist_bound)
+    return SimpleNamespace(drive_at=drive_at, next_kink=next_kink, settled=settled, twist_bound=twist_bound)
 
 
 @functools.cache

@@ -26,11 +26,17 @@ EPSILON = {"float64": 1.1e-16, "float32": 6.0e-8}  # half a unit in the last pla
 # Share of the embedded estimate that counts: errors of runs are then 0.02 to 0.6 of what the accuracy allows
 # (docs/numerics.md).
 ESTIMATE_SHARE = 0.1
+# Displacement of nodes per angle of spin [um]: the radius of the helix of a flagellum of E. coli. Spins count where a
+# motor's torque depends on its rate: a wrong turn of the tripod is not undone there.
+SPIN_LEVER = 0.2
+# Where a motor is let go or caught, its tripod's velocity jumps by hundreds of turns per second. A step across that is
+# accepted once its estimate is below what the accuracy allows in this time [s].
+LONGEST_JUMP = 2.0e-5
 ROUND_OFF_FACTOR = 5.0  # an estimate below this times its usual round-off is taken to be round-off
 
 
 @functools.cache
-def _kernels(p: Precision) -> SimpleNamespace:
+def _kernels(p: Precision, motor_law: bool) -> SimpleNamespace:
     real = p.real
     Model, State = structs(p).Model, structs(p).State
     Chart, Rkc = chart_stage.struct(p), struct(p)
@@ -38,10 +44,11 @@ def _kernels(p: Precision) -> SimpleNamespace:
     accept, smallest = f.accept, f.smallest
     add_estimate = accuracy.functions(independent=False).add
     advanced = clock.functions().advanced
-    module = p.module("rkc_estimate")
+    module = p.module("rkc_estimate", "motor_law" * motor_law)
     weights = (round(x * ESTIMATE_SHARE, 12) for x in (0.4, 0.8, 0.4 * ROUND_OFF_FACTOR))
     rate_weight, increment_weight, round_off_weight = (wp.constant(real(x)) for x in weights)
-    epsilon = wp.constant(real(EPSILON[p.name]))
+    epsilon, lever = wp.constant(real(EPSILON[p.name])), wp.constant(real(SPIN_LEVER))
+    longest_jump = wp.constant(wp.float64(LONGEST_JUMP))
     no_fault, inaccurate = wp.constant(wp.int32(NO_FAULT)), wp.constant(wp.int32(encode(Fault.ACCURACY)))
 
     @wp.kernel(module=module)
@@ -67,6 +74,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
         while e <= last:
             d = rate_weight * dt * (rkc.start_rate[e] + chart.rate[e]) - increment_weight * chart.increment[e]
             worst = wp.max(worst, wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+            if wp.static(motor_law):
+                worst = wp.max(worst, lever * wp.abs(d[3]))
             e += 1
         # Rates carry the round-off of positions times the stiffness of the stretch; an estimate below ROUND_OFF_FACTOR
         # times that is taken to be round-off.
@@ -99,6 +108,8 @@ def _kernels(p: Precision) -> SimpleNamespace:
             k += 1
         sound = control.fault[c] == no_fault and wp.isfinite(error)
         fixed = steps.error_rate[c] <= wp.float64(0.0)
+        if wp.static(motor_law) and error > longest_jump * steps.error_rate[c]:
+            steps.rejected_error[c] = wp.float64(0.0)  # shorter steps do help where a tripod's velocity jumps
         if accept(steps, c, control.step[c], error, round_off, sound, True):
             if add_estimate(steps.achieved, c, control.step[c], error, advanced(control, c), steps.shortest[c]):
                 control.fault[c] = inaccurate
@@ -120,7 +131,7 @@ def judge(model: DeviceModel, state: DeviceState, chart: Any, control: Control, 
         steps: step control of the cells.
         rkc: struct `Rkc`; `error` [um] and `round_off` [um] are written, per flagellum.
     """
-    kernels = _kernels(model.precision)
+    kernels = _kernels(model.precision, model.switches.has("motor law"))
     inputs = [model.data, state.data, control, chart, rkc]
     wp.launch(kernels.estimate, model.flagellum_count, inputs=inputs, device=model.device)
     inputs = [model.data, state.data, rkc, control, steps, chart]
