@@ -177,6 +177,7 @@ def test_even_and_given_anchors(folder):
         ("[axes]\nmotor.torque = {from = 1, to = 2}\n", ["motor.torque", "count"]),
         ("[axes]\nmotor.torque = {from = 1, to = inf, count = 3}\n", ["motor.torque"]),
         ("[axes]\nmotor.torque = {from = 1, to = 2, count = 1.5}\n", ["motor.torque.count"]),
+        ("[axes]\nmotor.torque = {from = 1, to = 2, count = 1}\n", ["motor.torque.count = 1", "2 or more"]),
         ("[random]\nseed = -1\n", ["random.seed"]),
         ("[random]\ndraws = 0\n", ["random.draws"]),
         ("[random]\nmotor.torque = {low = 3, high = 2}\n", ["random.motor.torque", "low"]),

@@ -217,6 +217,7 @@ def read(path: str | Path, overrides: Sequence[str] = (), grid: Sequence[str] = 
         axes = grid_axes(grid)
         if not {"base", "axes"} & table.keys():
             base = load(path, overrides)
+            _refuse_axes(axes, overrides)
             return Sweep(base, axes, name=base.name)
         return _built(path, table, overrides, axes)
     except SceneError as error:
@@ -236,12 +237,21 @@ def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes:
             raise SceneError(key, table[key], f"must be a table [{key}]")
     given = _flat(table.get("axes", {}))
     found = {key: _axis(f"axes.{key}", values) for key, values in given.items()} | dict(axes)
+    _refuse_axes(found, overrides)
     name = table.get("name", path.stem)
     if not isinstance(name, str):
         raise SceneError("name", name, "must be a text")
     scene = load(path.parent / base, {**_flat(table.get("set", {})), **read_overrides(overrides)})
     scene = with_values(scene, {"name": name})
     return Sweep(scene, found, _flat(table.get("random", {})), _count("repeats", table.get("repeats", 1)), name)
+
+
+def _refuse_axes(axes: Iterable[str], overrides: Sequence[str]) -> None:
+    """That no value of the command line is one that an axis would replace in every member."""
+    for key, value in read_overrides(overrides).items():
+        if key in axes:
+            problem = f"is an axis of the sweep as well; --grid {key}={written(value)} takes the place of that axis"
+            raise SceneError(key, value, problem, source="--set")
 
 
 def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
@@ -287,6 +297,8 @@ def _axis(key: str, values: Any) -> list[Any]:
             raise SceneError(f"{key}.spacing", spacing, "must be one of linear, log")
         if not all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
             raise SceneError(key, values, "must have finite numbers as from and to")
+        if values["count"] == 1 and ends[0] != ends[1]:
+            raise SceneError(f"{key}.count", 1, "must be 2 or more where from and to differ")
         if spacing == "log" and min(ends) <= 0.0:
             raise SceneError(key, values, "must have from and to above 0 where spacing is log")
         spaced = np.geomspace if spacing == "log" else np.linspace
