@@ -174,17 +174,18 @@ def test_steps_are_of_second_order_through_the_knee_and_the_steppers_agree(devic
         assert coarse > 9 * fine  # second order: 16; first: 4
 
 
-@pytest.mark.parametrize("hook", [{}, {"hook.length": 0.037, "hook.stiffness": 1.35}])
+@pytest.mark.parametrize("hook", [{}, {"hook.length": 0.037, "hook.stiffness": 1.35, "motor.reverse_torque": 0.47}])
 def test_rkc_keeps_its_accuracy_where_motors_turn_back_within_a_ramp(hook, precision, device):
     """They are let go and caught again: tripods spring back at hundreds of turns per second, which no node feels."""
     values = {
         **CURVE,
         **hook,
-        "flagella.length": 2.8,
+        "flagellum.0.length": 2.7,
+        "flagellum.1.length": 3.0,
         "flagella.bending_rigidity": 16.0,
         "flagella.stretching_stiffness": 6000.0,
-        "motor.torque": -0.8,
-        "flagellum.1.torque": 0.8 if hook else -0.8,
+        "flagellum.0.torque": -0.8,
+        "flagellum.1.torque": 0.8,
         "motor.knee": 30.0,
         "motor.no_load": 82.0,
         "motor.switching": "schedule",

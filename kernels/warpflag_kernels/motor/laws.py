@@ -82,8 +82,8 @@ def curves(p: Precision) -> SimpleNamespace:
         return law.switch_drive[low] + share * (law.switch_drive[high] - law.switch_drive[low])
 
     @wp.func(module=module)
-    def next_kink(model: Model, c: wp.int32, time: wp.float64, target: wp.float64):
-        """First time after `time` at which the drive of a motor of cell c has a corner, or target before that [s]."""
+    def next_corner(model: Model, c: wp.int32, time: wp.float64, target: wp.float64):
+        """Time [s] of the first corner of a drive in cell c after `time`, or `target` if that is before it."""
         law = model.motor_law[0]
         found = target
         after = time + at_once
@@ -153,7 +153,7 @@ def curves(p: Precision) -> SimpleNamespace:
             k += 1
         return bound
 
-    return SimpleNamespace(drive_at=drive_at, next_kink=next_kink, settled=settled, twist_bound=twist_bound)
+    return SimpleNamespace(drive_at=drive_at, next_corner=next_corner, settled=settled, twist_bound=twist_bound)
 
 
 @functools.cache

@@ -55,7 +55,7 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
     stage_factor, most_stages = wp.constant(wp.float64(STAGE_FACTOR)), wp.constant(wp.float64(MOST_STAGES))
     tolerance = wp.constant(wp.float64(STEP_TOLERANCE))
     no_fault, unstable = wp.constant(wp.int32(NO_FAULT)), wp.constant(wp.int32(encode(Fault.UNSTABLE)))
-    twist_bound, next_kink = motor_laws.curves(p).twist_bound, motor_laws.curves(p).next_kink
+    twist_bound, next_corner = motor_laws.curves(p).twist_bound, motor_laws.curves(p).next_corner
 
     @wp.func(module=module)
     def outgrown(control: Control, rkc: Rkc, c: wp.int32):
@@ -81,8 +81,8 @@ def _kernels(p: Precision, euler: bool, motor_law: bool = False, by_cells: bool 
                 wp.atomic_sub(control.unfinished, 0, 1)
                 return
             end = control.target[c]
-            if wp.static(motor_law):  # a kink within a step is seen by no estimate
-                end = next_kink(model, c, control.time[c], end)
+            if wp.static(motor_law):  # no estimate sees one within a step
+                end = next_corner(model, c, control.time[c], end)
             left = end - control.time[c]
             if steps.error_rate[c] > zero:
                 control.step[c] = next_step(steps, c, control.longest_step[c], left)
