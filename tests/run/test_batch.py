@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
-import warp as wp
-from warpflag_kernels.base.types import structs
 from warpflag_kernels.stepping.health import Fault
 
 from tests.helpers import cell, touching_cell
@@ -170,70 +167,3 @@ def test_cells_are_counted_from_the_end_too(device):
             batch.cell_state(beyond)
         with pytest.raises(IndexError):
             batch.evaluate(beyond)
-
-
-FIRST = {
-    **{"hook.length": 0.055, "hook.stiffness": 0.65, "hook.stiffening_torque": 0.5, "steric.strength": 0.8},
-    **{"motor.law": "torque_speed", "motor.torque": 1.26, "motor.knee": 50.0, "motor.no_load": 200.0},
-    **{"motor.reverse_torque": 1.0, "motor.reverse_knee": 40.0, "motor.switching": "schedule"},
-    **{"motor.switch_times": (0.1, 0.2), "motor.switch_ramp": 1e-3, "motor.axis_angle": 50.0},
-    **{"polymorphs.enabled": True, "polymorphs.nucleation": 1.1, "polymorphs.propagation": 0.6},
-    **{"external.force_per_length": (0.0, 0.1, 0.0), "external.body_force": (0.2, 0.0, 0.0)},
-    **{"hydrodynamics.mode": "consistent", "hydrodynamics.body_flow": False},
-}
-OTHER = {
-    **{"hook.length": 0.1, "hook.stiffness": 0.4, "hook.stiffening_torque": 0.2, "steric.strength": 0.5},
-    **{"motor.torque": 0.7, "motor.knee": 20.0, "motor.no_load": 90.0},
-    **{"motor.reverse_torque": 0.3, "motor.reverse_knee": 10.0, "motor.rate": 30.0},
-    **{"motor.switch_times": (0.3, 0.5, 0.7), "motor.switch_ramp": 3e-3, "motor.axis_angle": 30.0},
-    **{"polymorphs.nucleation": 1.5, "polymorphs.propagation": 0.4, "polymorphs.front_speed": 40.0},
-    **{"external.force_per_length": (0.3, 0.0, 0.1), "external.body_force": (0.0, 0.4, 0.1)},
-    **{"fluid.viscosity": 2e-3, "body.length": 3.0, "body.width": 1.0, "flagella.filament_radius": 0.012},
-    **{"flagella.bending_rigidity": 3.0, "flagella.twist_rigidity": 4.0, "flagella.stretching_stiffness": 2e3},
-    **{"flagella.hook_twist_factor": 2.0, "flagella.intrinsic_curvature": (0.0, 1.0, -2.0)},
-    **{"flagella.segment_length": 0.25},
-}
-NOISY = {"fluid.temperature": 298.0, "fluid.noise_tolerance": 0.1, "fluid.seed": 1, "numerics.time_step": 1e-6}
-HOTTER = {"fluid.temperature": 310.0, "fluid.noise_tolerance": 0.05, "fluid.seed": 2, "numerics.time_step": 2e-6}
-
-
-def numbers(part: Any, kind: Any, path: str = "") -> dict[str, np.ndarray]:
-    """Arrays of numbers in a struct of the device, by name; those that only say where things lie are left out."""
-    found = {}
-    for name, var in kind.vars.items():
-        value = getattr(part, name)
-        if not isinstance(var.type, wp.array):
-            found |= numbers(value, var.type, f"{path}{name}.")
-        elif var.type.dtype is not wp.int32 and not hasattr(var.type.dtype, "vars") and value is not None:
-            found[path + name] = value.numpy() if value.size else np.zeros(0)
-    return {name: values for name, values in found.items() if len(values)}
-
-
-def test_every_number_of_a_member_is_that_of_its_own_scene(device):
-    """Two scenes that differ in every number: what the device has of the second in a batch, and alone."""
-    scenes = [cell({**FIRST, "numerics.stepper": "implicit"}), cell({**FIRST, **OTHER, "numerics.stepper": "implicit"})]
-    batch, alone = (Simulation(own, device=device).system.model for own in (scenes, scenes[1]))
-    told, kind = [], structs(batch.precision).Model
-    parts = [(batch.data, alone.data, kind)]
-    parts += [
-        (own, getattr(alone.optional, name), kind.vars[name].type.dtype) for name, own in vars(batch.optional).items()
-    ]
-    for both, one, own_kind in parts:
-        single = numbers(one, own_kind)
-        for name, values in numbers(both, own_kind).items():
-            own = single[name]
-            np.testing.assert_array_equal(values[-len(own) :], own, err_msg=name)
-            assert not np.array_equal(values[: len(own)], own), f"{name} does not tell the scenes apart"
-            told.append(name)
-    assert len(told) > 25
-
-
-def test_noise_of_a_member_is_that_of_its_own_scene(device):
-    scenes = [
-        cell({**values, "numerics.stepper": "implicit", "hydrodynamics.mode": "all"}) for values in (NOISY, HOTTER)
-    ]
-    sim = Simulation(scenes, device=device)
-    energy, seed = sim.stepper.noise.energy.numpy(), sim.stepper.noise.seed.numpy()
-    np.testing.assert_allclose(energy, 1.380649e-5 * np.array([298.0, 310.0]))
-    assert seed.tolist() == [1, 2] and sim.stepper.lanczos.data.tolerance.numpy().tolist() == [0.1, 0.05]
-    assert sim.system.control.longest_step.numpy().tolist() == [1e-6, 2e-6]
