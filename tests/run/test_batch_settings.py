@@ -157,8 +157,8 @@ def leaves(part: Any, path: str, seen: dict[int, Any]) -> Iterator[tuple[str, An
             inside = part
         elif isinstance(part, list | tuple):
             inside = dict(enumerate(part))
-        elif hasattr(part, "_cls") and not isinstance(part, wp.array):
-            inside = {name: getattr(part, name) for name in part._cls.vars}
+        elif type(part).__module__.startswith("warp._src.codegen"):  # a struct of device arrays
+            inside = {name: value for name, value in vars(part).items() if name[0] != "_"}
         elif type(part).__module__.startswith(("warpflag", "types")) and hasattr(part, "__dict__"):
             inside = vars(part)
         for name, value in inside.items():
