@@ -99,6 +99,8 @@ def sweep(options: argparse.Namespace) -> Outcome | str:
         for option, value in (("--jobs", options.jobs), ("--time", options.time), ("--slurm-set", options.slurm_set)):
             if value:
                 raise OptionError(f"{option} is for --slurm or --slurm-script; --max-wall ends a sweep on this machine")
+    elif options.max_wall is not None or options.share != (0, 1):
+        raise OptionError("--max-wall and --share are of sweeps on this machine; --time and --jobs say them of jobs")
     for pair in options.slurm_set:
         key, sign, value = pair.partition("=")
         if not (key and sign and value) or key.startswith("-"):
@@ -168,7 +170,16 @@ def _submitted(started: SweepRun, options: argparse.Namespace, seconds: float) -
     further = dict(pair.partition("=")[::2] for pair in options.slurm_set)
     if (options.device or "").startswith("cuda") and not any("gres" in key or "gpu" in key for key in further):
         tell(f"--device {options.device}: these jobs ask Slurm for no GPU; --slurm-set gres=gpu:1 does", DONE)
-    jobs = slurm.Jobs(started, seconds, options.jobs, options.workers, options.device, options.movies, further)
+    jobs = slurm.Jobs(
+        started,
+        seconds,
+        options.jobs,
+        options.workers,
+        options.device,
+        options.movies,
+        options.checkpoint_interval,
+        further,
+    )
     return jobs.script() if options.slurm_script else jobs.submit()
 
 

@@ -108,6 +108,8 @@ def plot(options: argparse.Namespace) -> int:
     compared = options.kind == "comparison" or (options.kind is None and (len(runs) > 1 or options.y))
     if len(runs) > 1 and not compared:
         return tell("plot --as dashboard takes one DIR", BAD_INPUT)
+    if options.y and not compared:
+        return tell("--y is for comparisons: plot --as comparison", BAD_INPUT)
     figures.save(figures.comparison(runs, options.y) if compared else figures.dashboard(runs[0]), options.output)
     print(options.output)
     return DONE
@@ -153,8 +155,12 @@ def export(options: argparse.Namespace) -> int:
     path = Path(options.output or Path(options.directories[0]) / name)
     if len(options.directories) > 1 and (options.to != "usd" or not options.output):
         return tell("export takes several DIR for one movie: --to usd, with -o", BAD_INPUT)
-    if options.mesh and options.to != "usd":
-        return tell("--mesh is for movies: --to usd", BAD_INPUT)
+    of_movies = {"--mesh": options.mesh, "--follow": options.follow, "--fps": options.fps}
+    of_movies |= {"--slow-down": options.slow_down, "--clip-frames": options.clip_frames}
+    of_movies |= {"--color": None if options.to == "html" else options.color}
+    for option, value in of_movies.items():
+        if value and options.to != "usd":
+            return tell(f"{option} is for movies: --to usd", BAD_INPUT)
     with ExitStack() as stack:
         records = [stack.enter_context(Record(directory)) for directory in options.directories]
         if options.to == "usd":

@@ -76,11 +76,12 @@ def test_a_job_runs_with_what_was_said_of_it(tmp_path, capsys):
     scene, out = tmp_path / "cell.toml", tmp_path / "out"
     scene.write_text("format = 1\nduration = 4e-5\nframes = 4\n")
     plan = ["sweep", str(scene), "--grid", "motor.torque=1,2", "-o", str(out), "--slurm-script", "--jobs", "2"]
-    assert main([*plan, "--time", "90:00", "--workers", "3", "--device", "cuda:1", "--movies"]) == 0
+    said = ["--workers", "3", "--device", "cuda:1", "--movies", "--checkpoint-interval", "1:30"]
+    assert main([*plan, "--time", "90:00", *said]) == 0
     script = capsys.readouterr().out
     (line,) = (line for line in script.splitlines() if " -m warpflag " in line)
     assert f" sweep --resume {out} --share " in line
-    assert line.endswith(" --quiet --workers 3 --device cuda:1 --movies &")
+    assert line.endswith(" --quiet --workers 3 --device cuda:1 --movies --checkpoint-interval 90 &")
     assert "#SBATCH --cpus-per-task=3\n" in script and "#SBATCH --time=01:30:00\n" in script
     assert main(["sweep", "--resume", str(out), "--slurm-script", "--jobs", "1"]) == 0
     assert " --quiet --workers 1 &\n" in capsys.readouterr().out

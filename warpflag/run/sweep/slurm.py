@@ -37,6 +37,7 @@ class Jobs:
         workers: processes of a job; None: 1.
         device: of all workers; None: every GPU of the job in turn, or the CPU.
         movies: whether each member gets a movie.
+        checkpoint_seconds: wall time between two checkpoints of a member [s]; None: that of `Run`.
         further: options of sbatch by name without dashes, such as partition or gres.
     """
 
@@ -46,6 +47,7 @@ class Jobs:
     workers: int | None = None
     device: str | None = None
     movies: bool = False
+    checkpoint_seconds: float | None = None
     further: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -72,6 +74,8 @@ class Jobs:
         given: list[str] = ["--workers", str(self.workers or 1)]
         given += ["--device", self.device] if self.device else []
         given += ["--movies"] if self.movies else []
+        if self.checkpoint_seconds is not None:
+            given += ["--checkpoint-interval", f"{self.checkpoint_seconds:g}"]
         directory = str(self.sweep.directory.resolve())
         return [sys.executable, "-m", "warpflag", "sweep", "--resume", directory, "--share", share, "--quiet", *given]
 
