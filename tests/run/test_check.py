@@ -54,6 +54,7 @@ def test_sizes_of_what_is_left_out_are_those_of_theory():
     # Clamped rod in equilibrium: kT L^3/(3 A) in each of two directions.
     rest = math.sqrt(2 * 1.380649e-23 * 298.0 * 1e18 * 2.0**3 / (3 * 3.5))
     assert told(r"tips by about ([\d.]+) um", **straight, duration=10.0, frames=1) == pytest.approx(rest, rel=0.05)
+    assert told(r"um \(rms\) in (\S+) ms", **straight, duration=2.5e-3) == 2.5
     # Of a helix the lever is the axial length: kT z^2 L/(3 A).
     rest *= turning(small({"flagella.length": 6.0})).axial_length * math.sqrt(6.0 / 2.0**3)
     assert told(r"tips by about ([\d.]+) um", flagella__length=6.0, duration=10.0) == pytest.approx(rest, rel=0.05)

@@ -155,7 +155,7 @@ def test_a_finished_run_says_that_it_is_done(tmp_path):
     directory = executed(small(), tmp_path / "made")
     before = (directory / "run.h5").read_bytes()
     outcome = run.resume(str(directory)).execute(quiet=True)
-    assert outcome.status == "done" and "done already" in outcome.message
+    assert outcome.status == "done" and "done already, 0.08 ms" in outcome.message
     assert (directory / "run.h5").read_bytes() == before
 
 

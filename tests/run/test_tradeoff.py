@@ -109,7 +109,10 @@ def test_windows_begin_before_what_they_are_named_after():
 def test_a_mean_is_known_to_a_per_cent_after_as_many_parts_as_its_spread_asks_for():
     """Parts of 2 ms that differ by 5 % of their mean: the mean of 25 of them has an error of 1 %."""
     rates = {"body_speed": (-100.0, 5.0), "body_rate": (-100.0, 0.9), "motor_rate": (0.0, 1.0)}
-    said = report.text([], [], windows.Course([], 1e-3, 48e-3, rates, 2e-3))
+    late = windows.Window("late", 47e-3, initial_state(small()))
+    said = report.text([], [], windows.Course([late], 1e-3, 48e-3, rates, 2e-3, "the record ends there"))
+    assert said.startswith("windows of 1 ms: late from 47 ms\nthe course was followed to 48 ms, not to")
+    assert "means over the last third of 48 ms" in said
     assert "body_speed: -100, parts of 2 ms differ by 5: 50 ms" in said
     assert "differ by 0.9: one part will do" in said and "differ by 1: unknown" in said
 

@@ -24,6 +24,9 @@ def test_short_lines_say_what_something_is(tmp_path):
     simulation = warpflag.Simulation(small(), device="cpu")
     assert repr(simulation) == "<Simulation of small on cpu: 0 of 0.08 ms, stepper implicit>"
     assert repr(simulation.state) == "<CellState at 0 ms, step 0: 2 flagella, 22 nodes>"
+    simulation.advance(2e-5)
+    assert repr(simulation) == "<Simulation of small on cpu: 0.02 of 0.08 ms, stepper implicit>"
+    assert repr(simulation.state).startswith(f"<CellState at 0.02 ms, step {simulation.steps[0]}: ")
     with made_record(tmp_path, 3) as record:
         assert repr(record) == f"<Record {tmp_path}/run.h5: 3 flagella, 3 frames to 0.1 ms>"
 
@@ -31,6 +34,7 @@ def test_short_lines_say_what_something_is(tmp_path):
 def test_a_scene_shows_what_differs_and_everything():
     shown = THREE._repr_html_()
     changed, everything = shown.split("<details>")
+    assert f"</b>: {1e3 * THREE.duration:g} ms, 3 flagella" in changed
     assert "flagella.opening_angle" in changed and "50.0" in changed and "flagellum.1.length" in changed
     assert "motor.torque" not in changed
     assert "motor.torque" in everything and "pN µm" in everything

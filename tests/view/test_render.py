@@ -117,6 +117,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
         (run, "p.gif", {"snapshots": 3}, "for pictures"),
         (run, "p.png", {"snapshots": 0}, "snapshots 0"),
         *((run, "p.png", {"times": [1e-4, t]}, "the movie has 0 to 0.55 ms") for t in (math.nan, math.inf, -1e-6, 1e6)),
+        (run, "p.png", {"times": [0.1]}, "times 100: the movie has 0 to 0.55 ms"),
         (run, "p.png", {"snapshots": 900, "size": (64, 64)}, "do not fit"),
         (run / "movie.usdc", "p.png", {"shot": Shot()}, "movie.usdc"),
         (tmp_path / "junk.usdc", "p.png", {}, "junk.usdc"),
