@@ -111,6 +111,17 @@ def test_run_turned_and_far_away(precision, device):
         assert np.abs(found - expected).max() < PLACES[precision]
 
 
+def test_estimates_of_steps_do_not_know_how_the_cell_is_turned(precision, device):
+    scene = cell({"numerics.stepper": "rkc", "numerics.time_step": 2e-6}, precision)
+    start = shaken(scene, seed=5, node=0.002, spin=0.05)
+    estimates = []
+    for x in (start, moved_rigidly(start, np.array([0.5 * np.pi, 0.0, 0.0]), np.zeros(3))):  # y to z
+        sim = Simulation(scene, device=device, starts=x)
+        sim.advance(1e-5)
+        estimates.append(np.array(sim.stepper.steps.achieved.total.numpy()[0]))
+    assert close(*estimates, precision=precision) and estimates[0] > 0.0
+
+
 @pytest.mark.parametrize("more", [{}, FLOW])
 def test_mirrored_run(more, precision, device):
     scene, start = cell_in_contact(precision, more)
