@@ -86,6 +86,8 @@ class RkcStepper:
         comoving_chart.commit(s.model, s.state, s.chart)
         health.remember(s.model, s.state, s.chart, s.guard, s.control)
         terms.after_step(s.model, s.state, s.chart, s.control, counted=False)
+        if any(term.jumps for term in s.model.terms):  # the next step begins with other forces
+            launch_right_hand_side(s.model, s.state)
         if not self._euler:
             comoving_chart.fit_flagellum_spin(s.model, s.state, s.chart)
 

@@ -56,6 +56,7 @@ class Term:
         after_step: changes the term's own state once a step has been accepted and committed, a part of a pass:
             `after_step(model, state, chart, control, counted)`; `counted` says whether the clocks have been advanced to
             the end of the step. None: it has no such state.
+        jumps: whether that can change forces at the pose that the step has led to.
         carried: arrays of that state, by their dotted names in `DeviceState.optional`; checkpoints hold them.
     """
 
@@ -68,6 +69,7 @@ class Term:
     within_step: "Term | None" = None
     timed: bool = False
     after_step: Callable[..., None] | None = None
+    jumps: bool = False
     carried: tuple[str, ...] = ()
 
 

@@ -167,7 +167,12 @@ def structs(p: Precision) -> SimpleNamespace:
 
         form: wp.array(dtype=wp.int32)  # 0, 1 or 2
         before: wp.array(dtype=wp.int32)  # form before it flipped last
-        changed: wp.array(dtype=wp.float64)  # when it flipped last [s]
+        changed: wp.array(dtype=wp.float64)  # from when on it has its present form [s]
+        flipped: wp.array(dtype=wp.float64)  # end of the step that was found in, no earlier [s]
+        looked: wp.array(dtype=wp.float64)  # when it was looked at last [s]
+        # What moments were beyond their thresholds then, those that nucleate and those that propagate; 0 where that is
+        # not known [pN um].
+        beyond: wp.array(dtype=wp.vec2d)
         rest_strain: wp.array(dtype=vec3)  # the array of `Rod`, which changes with time here [rad]
 
     @wp.struct
@@ -325,6 +330,9 @@ def allocate_state(model: DeviceModel) -> tuple[Any, SimpleNamespace]:
     if model.switches.has("polymorphs"):
         parts.forms.form, parts.forms.before = zeros(elements, wp.int32), zeros(elements, wp.int32)
         parts.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
+        parts.forms.flipped = wp.full(elements, NEVER, dtype=wp.float64, device=device)
+        parts.forms.looked = zeros(elements, wp.float64)
+        parts.forms.beyond = zeros(elements, wp.vec2d)
         parts.forms.rest_strain = model.data.rod.rest_strain
     attach(parts, s, device)
     return s, parts

@@ -16,8 +16,10 @@ From times on that are drawn before the run begins, joints of form 1 go on to fo
 as long as the motor winds the filament up. They flip back to form 0 as those of form 1 do.
 
 A joint's ground state goes over within a ramp, as a smooth step, so that the steppers see quadratic energies that
-change with time. Joints are looked at where a step has been accepted, and neither flip nor lead to a flip while their
-ramp lasts.
+change with time. Joints neither flip nor lead to a flip while their ramp lasts. They are looked at where a step has
+been accepted, but flip from the time on at which they had reason to: when the last ramp of theirs or of the neighbour
+that leads them was over, and when the moment passed its threshold, in a straight line between two looks. The next step
+begins with that part of the ramp behind it. Were it the end of the step, a front would lag by half a step per joint.
 
 Source: Hotani, J. Mol. Biol. 156, 791 (1982): torques of -1.1 and +0.4 pN um take filaments from normal to semicoiled
 and back, in transitions that travel along the filament.
@@ -79,7 +81,8 @@ def functions(p: Precision) -> SimpleNamespace:
 def _kernels(p: Precision) -> SimpleNamespace:
     real, vec3 = p.real, p.vec3
     Model, State, Chart = structs(p).Model, structs(p).State, chart_stage.struct(p)
-    ramped, joint_strain = functions(p).ramped, rotations.functions(p).joint_strain
+    ramped, ground_state = functions(p).ramped, functions(p).ground_state
+    joint_strain = rotations.functions(p).joint_strain
     advanced = clock.functions().advanced
     end_length, half_turn = wp.constant(real(END_LENGTH)), wp.constant(real(math.pi))
     module = p.module("polymorphs")
@@ -97,18 +100,18 @@ def _kernels(p: Precision) -> SimpleNamespace:
             ramped(model, state, e, model.flagellum_of[e], c)
 
     @wp.func(module=module)
-    def strain_change(model: Model, state: State, chart: Chart, e: wp.int32):
+    def strain_change(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, now: wp.float64):
         """Strain of joint e beyond its ground state now [rad]."""
         w = joint_strain(
             chart.base.tangent[e], chart.base.tangent[e + 1], chart.base.director[e], chart.base.director[e + 1]
         )
-        return w - state.forms[0].rest_strain[e]
+        return w - ground_state(model, state, e, k, now)
 
     @wp.func(module=module)
-    def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32):
+    def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, now: wp.float64):
         """Moment of joint e along its ground state, against the handedness of form 0 [pN um]."""
         rest = model.polymorphs[0].rest_strain[3 * e + state.forms[0].form[e]]
-        d = strain_change(model, state, chart, e)
+        d = strain_change(model, state, chart, e, k, now)
         a = model.rod.bending_rigidity[k]
         moment = vec3(a * d[0], a * d[1], model.rod.twist_rigidity[k] * d[2])
         m = -wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k])
@@ -117,7 +120,16 @@ def _kernels(p: Precision) -> SimpleNamespace:
         return wp.float64(m)
 
     @wp.func(module=module)
-    def axial_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, root: wp.int32, tip: wp.int32):
+    def axial_moment(
+        model: Model,
+        state: State,
+        chart: Chart,
+        e: wp.int32,
+        k: wp.int32,
+        now: wp.float64,
+        root: wp.int32,
+        tip: wp.int32,
+    ):
         """Moment about the helix axis at joint e against the handedness of form 0 [pN um].
 
         The axis is the mean tangent over a turn around e, at the ends over the first or the last one.
@@ -139,7 +151,7 @@ def _kernels(p: Precision) -> SimpleNamespace:
             if wp.abs(j - e) <= beside:
                 a1 = chart.base.director[j] + chart.base.director[j + 1]
                 a2 = wp.cross(t, chart.base.director[j]) + wp.cross(u, chart.base.director[j + 1])
-                d = strain_change(model, state, chart, j)
+                d = strain_change(model, state, chart, j, k, now)
                 moment += real(0.5) * (a * d[0] * a1 + a * d[1] * a2 + c * d[2] * (t + u))
                 count += real(1.0)
             j += 1
@@ -151,6 +163,31 @@ def _kernels(p: Precision) -> SimpleNamespace:
         if hook[2] * rest[2] > real(0.0):
             m = -m
         return wp.float64(m)
+
+    @wp.func(module=module)
+    def flips(since: wp.float64, able: wp.float64, now: wp.float64, before: wp.float64, after: wp.float64):
+        """When a joint flips that is able to from a time on [s], between two looks; -1 if it does not.
+
+        Its moment was beyond the threshold by `before` at the first look, and is by `after` at the second [pN um].
+        """
+        if able > now:
+            return wp.float64(-1.0)
+        if before + (after - before) * (able - since) / (now - since) > wp.float64(0.0):
+            return able
+        if after > wp.float64(0.0):
+            return now - (now - since) * after / (after - before)
+        return wp.float64(-1.0)
+
+    @wp.func(module=module)
+    def going_on(model: Model, k: wp.int32, now: wp.float64):
+        """Since when joints of form 1 go on to form 2 [s], -1 if they do not now."""
+        i = model.polymorphs[0].first_second[k]
+        while i < model.polymorphs[0].first_second[k + 1]:
+            interval = model.polymorphs[0].second[i]
+            if now >= interval[0] and now < interval[1]:
+                return interval[0]
+            i += 1
+        return wp.float64(-1.0)
 
     @wp.kernel(module=module)
     def flip(
@@ -172,55 +209,67 @@ def _kernels(p: Precision) -> SimpleNamespace:
         now = control.time[c]
         if counted == 0:
             now = advanced(control, c)
-        rest = now - model.polymorphs[0].ramp[k]  # what changed after this is on its ramp
+        ramp = model.polymorphs[0].ramp[k]
         root = first + 1
         tip = model.first_node[k + 1] - 2
         reach = 1 + wp.int32(real(end_length) / model.rod.segment_length[k])
         nucleation = model.polymorphs[0].nucleation[k]
         propagation = model.polymorphs[0].propagation[k]
-        goes_on = bool(False)
-        i = model.polymorphs[0].first_second[k]
-        while i < model.polymorphs[0].first_second[k + 1]:
-            if now >= model.polymorphs[0].second[i][0] and now < model.polymorphs[0].second[i][1]:
-                goes_on = True
-            i += 1
-        # The joint before this one as it was when the step ended: `before` is 0 in form 0, 1 in another form, 2 on its
-        # ramp or where there is no joint; `form_before` is its form, 0 on its ramp, 2 at the root.
+        begun = going_on(model, k, now)
+        # The joint before this one as it was when the step ended: `before` is 0 in form 0, 1 in another form, 2 where
+        # there is no joint; `form_before` is its form, 2 at the root; `over_before`, when its ramp is over [s].
         before = int(2)
         form_before = int(2)
+        over_before = state.forms[0].looked[root]
         e = root
         while e <= tip:
             form = state.forms[0].form[e]
             left = wp.min(form, 1)
-            own = int(left)
-            own_form = int(form)
-            if state.forms[0].changed[e] > rest:
-                own = 2
-                own_form = 0
-            else:
-                after = int(2)
-                if e < tip and state.forms[0].changed[e + 1] <= rest:
-                    after = wp.min(state.forms[0].form[e + 1], 1)
-                ends = e - root < reach or tip - e < reach
-                led = before == 1 - left or after == 1 - left
-                over = bool(False)
-                if led:
-                    m = axial_moment(model, state, chart, e, k, root, tip)
-                    over = (left == 0 and m > propagation[0]) or (left == 1 and m < propagation[1])
-                elif ends and (e == root or before == left) and (e == tip or after == left):
-                    if left == 0:
-                        over = end_moment(model, state, chart, e, k) > nucleation[0]
-                    else:
-                        over = axial_moment(model, state, chart, e, k, root, tip) < nucleation[1]
-                if over:
-                    state.forms[0].form[e] = 1 - left
-                elif form == 1 and goes_on and form_before == 2:
-                    state.forms[0].form[e] = 2
-                if state.forms[0].form[e] != form:
-                    state.forms[0].before[e] = form
-                    state.forms[0].changed[e] = now
-            before = own
-            form_before = own_form
+            over = state.forms[0].changed[e] + ramp
+            since = state.forms[0].looked[e]
+            after = int(2)
+            over_after = since
+            if e < tip:
+                after = wp.min(state.forms[0].form[e + 1], 1)
+                over_after = state.forms[0].changed[e + 1] + ramp
+            # How far moments are beyond their thresholds, also while a ramp still has to end before that counts.
+            nucleates = wp.float64(0.0)
+            propagates = wp.float64(0.0)
+            becomes = int(form)
+            when = wp.float64(-1.0)
+            able = wp.max(since, over)
+            led = bool(False)
+            if before == 1 - left or after == 1 - left:
+                leads = over_after
+                if before == 1 - left:
+                    leads = wp.where(after == 1 - left, wp.min(over_before, over_after), over_before)
+                led = leads <= now
+                m = axial_moment(model, state, chart, e, k, now, root, tip)
+                propagates = wp.where(left == 0, m - propagation[0], propagation[1] - m)
+                when = flips(since, wp.max(able, leads), now, state.forms[0].beyond[e][1], propagates)
+            if over <= now and not led and (e - root < reach or tip - e < reach):
+                if left == 0:
+                    nucleates = end_moment(model, state, chart, e, k, now) - nucleation[0]
+                else:
+                    nucleates = nucleation[1] - axial_moment(model, state, chart, e, k, now, root, tip)
+                when = flips(since, able, now, state.forms[0].beyond[e][0], nucleates)
+            if when >= wp.float64(0.0):
+                becomes = 1 - left
+            elif form == 1 and form_before == 2 and begun >= wp.float64(0.0) and wp.max(able, over_before) <= now:
+                becomes = 2
+                when = wp.max(wp.max(able, over_before), begun)
+            if becomes != form:
+                state.forms[0].before[e] = form
+                state.forms[0].form[e] = becomes
+                state.forms[0].changed[e] = when
+                state.forms[0].flipped[e] = now
+                nucleates = wp.float64(0.0)
+                propagates = wp.float64(0.0)
+            state.forms[0].beyond[e] = wp.vec2d(nucleates, propagates)
+            state.forms[0].looked[e] = now
+            before = left
+            form_before = form
+            over_before = over
             e += 1
 
     return SimpleNamespace(ground_states=ground_states, flip=flip)
@@ -249,5 +298,6 @@ POLYMORPHS = Term(
     functions=functions,
     timed=True,
     after_step=flip,
-    carried=("forms.form", "forms.before", "forms.changed"),
+    jumps=True,
+    carried=tuple(f"forms.{name}" for name in ("form", "before", "changed", "flipped", "looked", "beyond")),
 )

@@ -319,6 +319,11 @@ def _ramp_kernel(p: Precision) -> Any:
                 after = joint_strain(
                     state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
                 )
+                if state.forms[0].flipped[e] == control.time[c]:  # the last step ended without what began within it
+                    ended = model.polymorphs[0].rest_strain[3 * e + state.forms[0].before[e]]
+                    jump = wp.cw_mul(stiffness, at_start - ended)
+                    total -= wp.float64(wp.dot(jump, before - half * (ended + at_start)))
+                    within += wp.float64(half * wp.dot(jump, at_start - ended))
                 scaled = half * wp.cw_mul(stiffness, change)
                 total -= wp.float64(wp.dot(scaled, before - at_start + after - at_end))
                 d = wp.cw_mul(scaled, after - before - change)
