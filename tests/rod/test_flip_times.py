@@ -60,3 +60,11 @@ def test_joints_flip_at_times_that_neither_accuracy_nor_stepper_changes(values, 
         np.testing.assert_array_equal(other[2], last)
         np.testing.assert_allclose(other[1], times, rtol=0.0, atol=TIME_TOLERANCE)
         assert np.linalg.norm(other[3] - positions, axis=1).max() < accuracy * 2.0
+
+
+def test_ramps_that_end_within_the_step_that_they_begin_in_keep_the_power_balance(device):
+    values = {**HELD, **REAL_HOOK, "motor.torque": -1.26, "polymorphs.front_speed": 1e4, "body.anchored": False}
+    sim = Simulation(cell(values), device=device)
+    sim.advance(1e-3)
+    assert forms(sim).sum() >= 3
+    assert int(sim.stepper.balance.refused.numpy()[0]) == 0

@@ -312,14 +312,15 @@ def _ramp_kernel(p: Precision) -> Any:
             at_start = ground_state(model, state, e, k, control.time[c])
             at_end = ground_state(model, state, e, k, advanced(control, c))
             change = at_end - at_start
-            if wp.length_sq(change) > real(0.0):
+            jumped = state.forms[0].flipped[e] == control.time[c]  # within the step before, which ended without that
+            if jumped or wp.length_sq(change) > real(0.0):
                 before = joint_strain(
                     chart.base.tangent[e], chart.base.tangent[e + 1], chart.base.director[e], chart.base.director[e + 1]
                 )
                 after = joint_strain(
                     state.pose.tangent[e], state.pose.tangent[e + 1], state.pose.director[e], state.pose.director[e + 1]
                 )
-                if state.forms[0].flipped[e] == control.time[c]:  # the last step ended without what began within it
+                if jumped:
                     ended = model.polymorphs[0].rest_strain[3 * e + state.forms[0].before[e]]
                     jump = wp.cw_mul(stiffness, at_start - ended)
                     total -= wp.float64(wp.dot(jump, before - half * (ended + at_start)))
