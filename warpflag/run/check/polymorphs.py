@@ -8,8 +8,8 @@ from warpflag.scene import FlagellumSpec, Scene
 
 __all__ = ["of_polymorphs"]
 
-# Speed of a front beyond which joints change faster than a filament can turn [um/s]. Of one of 6 um under 1.26 pN um 93, 37
-# and 84 % change at 1e4 and h = 0.2, 0.1, 0.05, in steps that violate the power balance up to hundreds of times.
+# Speed of a front beyond which joints change faster than a filament can turn [um/s]. Of one of 6 um under 1.26 pN um
+# 93, 37 and 84 % change at 1e4 and h = 0.2, 0.1, 0.05, in steps that violate the power balance up to hundreds of times.
 FASTEST_FRONT = 1000.0
 
 
