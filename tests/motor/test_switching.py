@@ -113,6 +113,19 @@ def test_a_stopped_run_goes_on_with_the_same_bits_and_alone_as_in_a_batch(steppe
     assert not np.array_equal(whole.cell_state(0).positions, whole.cell_state(1).positions)
 
 
+def test_steps_of_rkc_end_at_the_corners_of_every_drive(device):
+    """Fixed steps of 1 us at most, in stretches of 3.5, 1.2 and 5.3 us; and of both motors in 2.5 us more."""
+    values = {"motor.switching": "schedule", "motor.switch_times": (3.5e-6,), "motor.switch_ramp": 1.2e-6}
+    values |= {"numerics.stepper": "rkc", "numerics.time_step": 1e-6, "flagella.length": 1.0}
+    values |= {"motor.law": "torque_speed", "motor.torque": 1.0}
+    steps = []
+    for more in ({}, {"flagellum.1.switch_times": (7.2e-6,)}):
+        sim = Simulation(cell({**values, **more}), device=device)
+        sim.advance(1e-5)
+        steps.append(int(sim.steps[0]))
+    assert steps == [4 + 2 + 6, 4 + 2 + 3 + 2 + 2]  # the second turns from 7.2 to 8.4 us
+
+
 def test_frames_hold_torque_and_drive(device):
     scene = cell(
         {

@@ -198,9 +198,11 @@ def test_flushed_frames_are_on_the_disk_before_anything_later_is(tmp_path, monke
 
     monkeypatch.setattr(os, "fsync", watched)
     recorder.write(frame(1))
+    recorder.flush(sync=False)
     assert synced == []
-    getattr(recorder, ending)()
-    assert synced == [path.stat().st_ino]
+    for _ in range(2):  # what is on the disk is not synced again
+        getattr(recorder, ending)()
+        assert synced == [path.stat().st_ino]
     with Record(path) as record:
         assert_holds_frames(record, range(2))
     recorder.close()

@@ -237,17 +237,15 @@ def test_what_has_no_motor_or_no_torque_is_told_of_as_that():
     assert not any("hook" in line for line in of_noise(small({**free, "fluid.temperature": 300.0}), 1e-6))
 
 
-@pytest.mark.parametrize("law, rate", [("rate", 20.0), ("torque_speed", 20.0), ("constant", 40.0)])
-def test_a_stiff_flagellum_turns_by_the_law_of_its_motor(law, rate):
-    """At half its stall torque a motor without a plateau turns at half its rate without load."""
+CURVES = [("rate", 0.0, 20.0), ("torque_speed", 0.0, 20.0), ("torque_speed", 20.0, 30.0), ("constant", 0.0, 40.0)]
+
+
+@pytest.mark.parametrize("law, knee, rate", CURVES)
+def test_a_stiff_flagellum_turns_by_the_law_of_its_motor(law, knee, rate):
+    """Under a load of 40 Hz at stall: halfway from the knee to the rate without load, 40 Hz above it, or 20 below."""
     drag = turning(small()).drag
-    motor = {
-        "motor.law": law,
-        "motor.torque": 40.0 * drag,
-        "motor.rate": -20.0,
-        "motor.knee": 0.0,
-        "motor.no_load": 40.0,
-    }
+    motor = {"motor.law": law, "motor.torque": 40.0 * drag, "motor.rate": -20.0}
+    motor |= {"motor.knee": knee, "motor.no_load": 40.0 + knee}
     assert turning(small(motor)).rate == pytest.approx(rate)
     if law == "rate":
         (hook,) = [line for line in lines(motor__law=law, motor__rate=0.65 / drag) if line.startswith("hook stiff")]

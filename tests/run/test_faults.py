@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from warpflag_kernels.stepping.health import Fault
+from warpflag_kernels.base import clock
+from warpflag_kernels.stepping.health import Fault, encode
 
 from tests.helpers import cell
-from warpflag.run.faults import NumericalError
+from warpflag.run.faults import NumericalError, found_faults
 
 FIXED = {"numerics.time_step": 1e-6}
 
@@ -15,6 +17,20 @@ def test_it_says_when_and_where():
     line = str(NumericalError(Fault.TWIST, 1.25e-3, 3, 1, 7, cell()))
     assert line.startswith("stopped at 1.25 ms: flagellum 1, segment 7: a joint is twisted")
     assert str(NumericalError(Fault.UNSOLVED, 1.25e-3, 3, 1, 7, cell())).startswith("stopped at 1.25 ms: no step")
+
+
+@pytest.mark.parametrize(
+    ("element", "place"), [(0, (0, 0, 0)), (10, (0, 0, 10)), (11, (0, 1, 0)), (22, (1, 0, 0)), (33, (1, 1, 0))]
+)
+def test_a_fault_belongs_to_the_flagellum_of_its_element(element, place):
+    """Two cells of two flagella with 10 segments each; the tripod is number 0 of its own."""
+    codes = np.full(2, clock.NO_FAULT)
+    codes[place[0]] = encode(Fault.TURN) + element
+    first_node, first_flagellum = np.array([0, 11, 22, 33, 44]), np.array([0, 2, 4])
+    found = found_faults(codes, np.array([1e-3, 2e-3]), first_node, first_flagellum, [cell(), cell()])
+    assert list(found) == [place[0]]
+    error = found[place[0]]
+    assert (error.cell, error.flagellum, error.segment) == place and error.time == 1e-3 * (1 + place[0])
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from tests.films import made_record
 from tests.view.usd.stages import at, faults
 from warpflag.scene import paper_scene, with_values
 from warpflag.view.usd import Shot, movie_stage, write_movie
-from warpflag.view.usd.camera import Extent, steady_path, view_axes
+from warpflag.view.usd.camera import Extent, add_camera, steady_path, view_axes
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +43,17 @@ def test_camera_frames_the_whole_path(movie):
     record, stage = movie
     assert_camera_sees_all(record, stage)
     assert UsdGeom.Xformable(at(stage, "/World/Camera")).GetTimeSamples() == []
+
+
+@pytest.mark.parametrize("toward, away", [(1.0, 1.0), (0.5, 90.0), (3.0, 0.1)])
+def test_all_that_lies_before_the_camera_is_within_its_clipping_range(toward, away):
+    """However deep the scene is; seen from where a breadth and a height of 10 um just fit in."""
+    stage = Usd.Stage.CreateInMemory()
+    add_camera(stage, np.eye(3), np.array([5.0, 5.0, 5.0, 5.0, toward, away]))
+    camera = UsdGeom.Camera(at(stage, "/World/Camera"))
+    distance = camera.GetCamera().transform.ExtractTranslation()[2]
+    near, far = camera.GetClippingRangeAttr().Get()
+    assert 0.0 < near < distance - toward and far > distance + away
 
 
 def test_spheres_reach_as_far_as_their_surfaces():
