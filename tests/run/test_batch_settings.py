@@ -14,8 +14,9 @@ import pytest
 import warp as wp
 
 from tests.helpers import cell
+from tests.plans import by_elements, plan
 from warpflag.run.simulation import Simulation
-from warpflag.scene import Scene
+from warpflag.scene import Scene, with_values
 
 SHARED = {
     **{"motor.bearing_torque": True, "motor.switching": "schedule", "polymorphs.enabled": True},
@@ -85,6 +86,11 @@ KINDS: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]]
         {"hydrodynamics.body_flow": True},
         {"body.translation": False, "hydrodynamics.body_beads": 40},
         {"body.axial_rotation": False, "hydrodynamics.body_beads": 50},
+    ),
+    "in contact": (
+        {"flagella.opening_angle": 0.0, "flagellum.0.azimuth": 0.0, "polymorphs.enabled": False},
+        {"flagellum.1.azimuth": 6.0, "motor.switch_times": (2e-7,)},
+        {"flagellum.1.azimuth": 5.7, "flagellum.2.azimuth": 180.0, "motor.switch_times": (5e-7, 6e-7)},
     ),
     "held": ({}, {"body.anchored": True}, {}),
     "noise": (
@@ -225,14 +231,35 @@ def test_every_number_of_a_member_is_that_of_its_own_scene(kind, device):
     assert len(settings) > 20 and settings <= telling
 
 
-@pytest.mark.parametrize("kind", ["implicit", "own values", "flow round the body", "noise", "noise, explicit"])
-def test_members_that_differ_in_every_number_go_on_as_alone(kind, device):
-    scenes = scenes_of(kind)
-    until = 4 * max(scene.numerics.time_step or 5e-7 for scene in scenes)
-    batch, *members = (Simulation(own, device=device) for own in (scenes, *scenes))
-    batch.advance(until)
-    kept = batch.checkpoint()
-    for c, member in enumerate(members):
+def carried(simulation: Simulation) -> dict[str, np.ndarray]:
+    """What goes on from step to step, and the tolerance of gaps in the last one, by name."""
+    law = getattr(simulation.stepper, "law", None)
+    return simulation.checkpoint() | ({} if law is None else {"law.gap_tolerance": law.gap_tolerance.numpy().copy()})
+
+
+GOING_ON = ["implicit", "own values", "flow round the body", "in contact", "noise", "noise, explicit"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [*((kind, {}) for kind in GOING_ON), ("in contact", {"numerics.stepper": "rkc"}), ("flow round the body", None)],
+)
+def test_members_that_differ_in_every_number_go_on_as_alone(kind, more, device):
+    """Whichever of them is the first; also with a thread for every element, as on a GPU (`more` is None)."""
+    scenes = [with_values(scene, more or {}) for scene in scenes_of(kind)]
+    how: dict[str, Any] = {"device": device} if more is not None else {"plan": by_elements(plan(scenes[0], device))}
+    until = 4 * max(scene.numerics.time_step or 2.5e-7 for scene in scenes)
+    alone = []
+    for scene in scenes:
+        member = Simulation(scene, **how)
         member.advance(until)
-        for name, values in member.checkpoint().items():
-            np.testing.assert_array_equal(batch.part(kept, c)[name], values, err_msg=f"{name} of member {c}")
+        alone.append(carried(member))
+        assert (member.cell_state().steric_force > 0.0) == (kind == "in contact")
+    for order in ((0, 1), (1, 0)):
+        batch = Simulation([scenes[k] for k in order], **how)
+        batch.advance(until)
+        kept = carried(batch)
+        for c, k in enumerate(order):
+            part = batch.part(kept, c)
+            for name, values in alone[k].items():
+                np.testing.assert_array_equal(part[name], values, err_msg=f"{name} of member {c} of {order}")
