@@ -23,7 +23,7 @@ def members() -> list[Scene]:
     return [
         small({"name": "a"}),
         small({"name": "b", "motor.torque": 1.0, "duration": 6e-5, "frames": 3}),
-        small({"name": "c", "flagella.count": 3, "flagella.length": 1.6}),
+        small({"name": "c", "flagella.count": 3, "flagella.opening_angle": 60.0, "flagella.length": 1.6}),
         small({"name": "d", "flagellum.1.length": 1.2, "duration": 1e-4, "frames": 20}),
     ]
 
@@ -43,6 +43,7 @@ def test_every_member_is_its_own_single_run_to_the_last_bit(tmp_path):
     scenes, made = members(), directories(tmp_path / "batch", 4)
     batch = run.start_batch(scenes, made, "cpu", strict=True, movies=False)
     assert [outcome.status for outcome in batch.execute_all(quiet=True)] == ["done"] * 4
+    assert [bool(summary(directory)["start"]) for directory in made] == [False, False, True, False]  # turned clear
     for scene, directory in zip(scenes, made, strict=True):
         assert_same_frames(alone(scene, tmp_path / scene.name), directory)
         single, member = summary(tmp_path / scene.name), summary(directory)

@@ -231,6 +231,17 @@ def test_every_number_of_a_member_is_that_of_its_own_scene(kind, device):
     assert len(settings) > 20 and settings <= telling
 
 
+@pytest.mark.parametrize("kind", ["implicit", "own values", "in contact"])
+def test_forces_and_powers_of_a_member_are_those_of_its_own_scene(kind, device):
+    scenes = scenes_of(kind)
+    batch, *alone = (Simulation(own, device=device) for own in (scenes, *scenes))
+    for c, member in enumerate(alone):
+        both, own = vars(batch.evaluate(c)), vars(member.evaluate())
+        assert both["supplied"].keys() == own["supplied"].keys() and sum(map(abs, own["supplied"].values())) > 0.0
+        for name in own:
+            np.testing.assert_equal(both[name], own[name], err_msg=f"{name} of member {c}")
+
+
 def carried(simulation: Simulation) -> dict[str, np.ndarray]:
     """What goes on from step to step, and the tolerance of gaps in the last one, by name."""
     law = getattr(simulation.stepper, "law", None)

@@ -23,14 +23,15 @@ def test_it_says_when_and_where():
     ("element", "place"), [(0, (0, 0, 0)), (10, (0, 0, 10)), (11, (0, 1, 0)), (22, (1, 0, 0)), (33, (1, 1, 0))]
 )
 def test_a_fault_belongs_to_the_flagellum_of_its_element(element, place):
-    """Two cells of two flagella with 10 segments each; the tripod is number 0 of its own."""
+    """Two cells of two flagella with 10 segments each; the tripod is number 0. The second cell has fixed steps."""
     codes = np.full(2, clock.NO_FAULT)
     codes[place[0]] = encode(Fault.TURN) + element
     first_node, first_flagellum = np.array([0, 11, 22, 33, 44]), np.array([0, 2, 4])
-    found = found_faults(codes, np.array([1e-3, 2e-3]), first_node, first_flagellum, [cell(), cell()])
+    found = found_faults(codes, np.array([1e-3, 2e-3]), first_node, first_flagellum, [cell(), cell(FIXED)])
     assert list(found) == [place[0]]
     error = found[place[0]]
     assert (error.cell, error.flagellum, error.segment) == place and error.time == 1e-3 * (1 + place[0])
+    assert ("take a shorter numerics.time_step" in str(error)) == (place[0] == 1)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from warpflag_kernels.stepping.health import Fault
 from warpflag_kernels.stepping.step_control import SHORTEST_STEP
 
 from tests.runs import executed, small, summary
-from warpflag.run import run
+from warpflag.run import execute, run
 from warpflag.run.simulation import NumericalError, Simulation
 from warpflag.run.summary import accuracy_kept, kept_words
 from warpflag.scene import paper_scene, with_values
@@ -142,14 +142,20 @@ def test_a_run_beyond_ten_times_its_accuracy_stops_or_says_so(tmp_path):
     assert "steps as short as estimates may ask for" in kept_words(facts)
 
 
-def test_a_run_that_ends_beyond_its_accuracy_is_not_done(tmp_path):
+def test_a_run_that_ends_beyond_its_accuracy_is_not_done(tmp_path, monkeypatch):
     """It has erred by more than a tenth of a millisecond may, but not yet by what stops it at once."""
-    started = run.start(small(), str(tmp_path / "short"), "cpu")
-    started.simulation.stepper.steps.achieved.span.fill_(3e-2)
-    outcome = started.execute(quiet=True)
+    scenes = [small({"duration": 4e-5, "frames": 4}), small()]
+    batch = run.start_batch(scenes, [tmp_path / "sound", tmp_path / "short"], "cpu", movies=False)
+    span = batch.simulation.stepper.steps.achieved.span
+    span.assign([0.0, 3e-2])
+    followed = []
+    monkeypatch.setattr(execute, "growth", lambda scene, *given: followed.append((scene, given[3])))
+    sound, outcome = batch.execute_all(quiet=True)
     found = summary(tmp_path / "short")
-    assert outcome.status == found["status"] == "stopped" and found["guards"]["violated"]["kind"] == "accuracy"
+    assert sound.status == "done" and outcome.status == found["status"] == "stopped"
+    assert found["guards"]["violated"]["kind"] == "accuracy" and found["guards"]["violated"]["time"] >= 8e-5
     assert found["frames"] == 9  # all of it is there
+    assert followed == [(scenes[1], 0.5 * found["guards"]["violated"]["time"] / found["steps"])]
     # Unless the scene says so, and with fixed steps, of which nothing was asked.
     for name, values in {"warned": {"numerics.on_accuracy": "warn"}, "fixed": {"numerics.time_step": 1e-6}}.items():
         started = run.start(small(values), str(tmp_path / name), "cpu")
