@@ -90,7 +90,7 @@ KINDS: dict[str, tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]]
     "in contact": (
         {"flagella.opening_angle": 0.0, "flagellum.0.azimuth": 0.0, "polymorphs.enabled": False},
         {"flagellum.1.azimuth": 6.0, "motor.switch_times": (2e-7,)},
-        {"flagellum.1.azimuth": 5.7, "flagellum.2.azimuth": 180.0, "motor.switch_times": (5e-7, 6e-7)},
+        {"flagellum.1.azimuth": 5.7, "flagellum.2.azimuth": 180.0, "motor.switch_times": (5e-7, 1e-2)},
     ),
     "held": ({}, {"body.anchored": True}, {}),
     "noise": (
@@ -274,3 +274,23 @@ def test_members_that_differ_in_every_number_go_on_as_alone(kind, more, device):
             part = batch.part(kept, c)
             for name, values in alone[k].items():
                 np.testing.assert_array_equal(part[name], values, err_msg=f"{name} of member {c} of {order}")
+
+
+def test_frames_of_members_that_differ_in_every_number_are_those_alone(device):
+    """Observables, too, drives and torques of motors that switch meanwhile among them."""
+    scenes = [
+        with_values(own, {"duration": end}) for own, end in zip(scenes_of("in contact"), (1e-6, 8e-7), strict=True)
+    ]
+    found: dict[int, list[Any]] = {0: [], 1: []}
+    for frames in Simulation(scenes, device=device).cell_frames():
+        for c, frame in frames.items():
+            found[c].append(frame)
+    for c, scene in enumerate(scenes):
+        expected = [frames[0] for frames in Simulation(scene, device=device).cell_frames()]
+        assert len(found[c]) == len(expected) == scene.frames + 1
+        assert (
+            expected[-1].observables["motor_drive"][0] < 1.0 and expected[-1].observables["steric_force_density"] > 0.0
+        )
+        for one, other in zip(found[c], expected, strict=True):
+            for name, values in vars(other).items():
+                np.testing.assert_equal(getattr(one, name), values, err_msg=f"{name} of member {c}")
