@@ -52,7 +52,8 @@ def add(commands: Any, add_limits: Callable[[argparse.ArgumentParser], None]) ->
         action="extend",
         default=[],
         metavar="KEY=FROM:TO:COUNT",
-        help="an axis, also KEY=FROM:TO:COUNT:log or KEY=A,B,C; several make all combinations",
+        help="an axis, also KEY=FROM:TO:COUNT:log, KEY=A,B,C or, of keys that vary together, KEY,OTHER=[A,B],[C,D]; "
+        "several make all combinations",
     )
     command.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="replace values of the base scene"

@@ -179,10 +179,20 @@ def _override(k: int, values: Mapping[str, Any]) -> FlagellumOverride:
         raise SceneError.joined(told) from None
 
 
+def _setting(key: str) -> Setting | None:
+    return _KEYS.get(re.sub(r"^flagellum\.\d+\.", "flagellum.", key))
+
+
 def is_whole(key: str) -> bool:
     """Whether a dotted key has whole numbers."""
-    setting = _KEYS.get(re.sub(r"^flagellum\.\d+\.", "flagellum.", key))
+    setting = _setting(key)
     return setting is not None and setting.kind == "integer"
+
+
+def unit_of(key: str) -> str:
+    """The unit of a dotted key's numbers, as in "pN s/um^2"; empty where they have none, or no scene has the key."""
+    setting = _setting(key)
+    return "" if setting is None else setting.unit
 
 
 def check_key(key: str, value: Any, brief: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Labels of runs by what differs between their scenes."""
+"""Labels of runs by what differs between their scenes; ranges and levels of the axes of figures."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from warpflag.observables.arrays import Array
 from warpflag.scene import Scene, dumps
 
-__all__ = ["Labels", "labels_of", "set_levels", "told_apart", "with_error"]
+__all__ = ["Labels", "in_equal_ratios", "labels_of", "set_levels", "told_apart", "with_error", "with_margin"]
 
 # They label runs only where nothing else differs.
 _WEAK_KEYS = ("name", "duration", "frames", "start.record", "start.frame")
@@ -116,3 +119,22 @@ def _short(text: str, digits: int) -> str:
         return f"{float(text):.{digits}g}"
     except ValueError:
         return text
+
+
+def with_margin(position: Array, logarithmic: bool) -> tuple[float, float]:
+    """The range of an abscissa, the same in every panel, with room for the markers."""
+    low, high = float(np.nanmin(position)), float(np.nanmax(position))
+    if logarithmic:
+        room = (high / low) ** 0.04
+        return low / room, high * room
+    room = 0.04 * (high - low) or 0.5
+    return low - room, high + room
+
+
+def in_equal_ratios(position: Array) -> bool:
+    """Whether the values of an abscissa, three at least, are spaced as those of a logarithmic axis."""
+    places = np.unique(position[np.isfinite(position)])
+    if len(places) < 3 or places[0] <= 0.0:
+        return False
+    ratios = np.diff(np.log(places))
+    return bool(np.ptp(ratios) < 1e-6 * ratios.mean())

@@ -16,8 +16,9 @@ import numpy as np
 
 from warpflag.base.output import OutputError, missing, text_of_file
 from warpflag.observables.arrays import Array
+from warpflag.scene.reading import unit_of
 from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
-from warpflag.view.labels import set_levels, told_apart, with_error
+from warpflag.view.labels import in_equal_ratios, set_levels, told_apart, with_error, with_margin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +29,7 @@ __all__ = ["DEFAULT_NUMBERS", "Table", "curves", "figure", "is_sweep", "maps", "
 DEFAULT_NUMBERS = ("rates.net_speed", "rates.motor_rate_lab", "rates.body_rate", "events.zipped")
 _MOST_WITHIN = 6  # lines whose legend stands within the first panel
 _BEFORE_NUMBERS = ("member", "point", "repeat", "status", "count")
-# Units of a table's numbers and of a scene's values by the last part of their name, and what one is in that unit.
+# Units of a table's numbers by the last part of their name, and what one is in that unit.
 _UNITS = {
     "net_speed": ("µm/s", 1.0),
     "body_speed": ("µm/s", 1.0),
@@ -38,12 +39,6 @@ _UNITS = {
     "zipped": ("ms", 1e3),
     "synchronised": ("ms", 1e3),
     "time": ("ms", 1e3),
-    "torque": ("pN µm", 1.0),
-    "opening_angle": ("deg", 1.0),
-    "axis_angle": ("deg", 1.0),
-    "viscosity": ("pN s/µm²", 1.0),
-    "length": ("µm", 1.0),
-    "anchor_offset": ("µm", 1.0),
     "motor_torque": ("pN µm", 1.0),
     "elastic_energy": ("pN µm", 1.0),
     "steric_force_density": ("pN/µm", 1.0),
@@ -57,7 +52,8 @@ class Table:
 
     Attributes:
         name: of the sweep's directory.
-        axes: dotted keys that the sweep varies along axes, in order.
+        axes: dotted keys that the sweep varies along axes, in order; of keys that vary together one that tells their
+            points apart.
         columns: every column of the table as text, by name.
     """
 
@@ -156,7 +152,16 @@ def read(directory: str | Path) -> Table:
     if not isinstance(axes, dict):
         raise OutputError(f"{path.with_name('sweep.toml')}: axes is no table of values by key")
     columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
-    return Table(Path(directory).resolve().name, tuple(key for key in axes if key in columns), columns)
+    leading = [key for axis in axes for key in _leading(axis.split(","), columns)]
+    return Table(Path(directory).resolve().name, tuple(leading), columns)
+
+
+def _leading(keys: list[str], columns: dict[str, list[str]]) -> list[str]:
+    """Of keys that vary together the first one that tells all their points apart; all of them where none does."""
+    keys = [key.strip() for key in keys if key.strip() in columns]
+    points = len(set(zip(*(columns[key] for key in keys), strict=True)))
+    alone = [key for key in keys if len(set(columns[key])) == points]
+    return alone[:1] or keys
 
 
 def figure(
@@ -247,11 +252,11 @@ def curves(table: Table, x: str | None = None, numbers: Sequence[str] = ()) -> F
             set_levels(panel.xaxis, words)
         elif numbered:
             panel.locator_params(axis="x", integer=True)
-        elif _in_equal_ratios(position):
+        elif in_equal_ratios(position):
             panel.set_xscale("log")
         else:
             panel.ticklabel_format(axis="x", scilimits=(-2, 5), useMathText=True)
-        panel.set_xlim(*_with_margin(position, panel.get_xscale() == "log"))
+        panel.set_xlim(*with_margin(position, panel.get_xscale() == "log"))
         _set_height(panel, values[np.isfinite(values)])
         if not table.axes:
             _show_mean(panel, values[np.isfinite(values)])
@@ -294,25 +299,6 @@ def _show_mean(panel: Axes, values: Array) -> None:
         error = values.std(ddof=1) / math.sqrt(len(values))
         panel.axhline(values.mean(), color="0.6", linewidth=0.8, zorder=0)
         panel.set_title(with_error(values.mean(), error), fontsize=8)
-
-
-def _with_margin(position: Array, logarithmic: bool) -> tuple[float, float]:
-    """The range of an abscissa, the same in every panel, with room for the markers."""
-    low, high = float(np.nanmin(position)), float(np.nanmax(position))
-    if logarithmic:
-        room = (high / low) ** 0.04
-        return low / room, high * room
-    room = 0.04 * (high - low) or 0.5
-    return low - room, high + room
-
-
-def _in_equal_ratios(position: Array) -> bool:
-    """Whether the values of an abscissa, three at least, are spaced as those of a logarithmic axis."""
-    places = np.unique(position[np.isfinite(position)])
-    if len(places) < 3 or places[0] <= 0.0:
-        return False
-    ratios = np.diff(np.log(places))
-    return bool(np.ptp(ratios) < 1e-6 * ratios.mean())
 
 
 @_style()
@@ -396,5 +382,5 @@ def _label(name: str) -> str:
         for part in name.split(".")
         if part not in ("rates", "observables", "events")
     )
-    unit = _UNITS.get(_leaf(name), ("", 1.0))[0]
+    unit = _UNITS.get(_leaf(name), ("", 1.0))[0] or unit_of(name).replace("um", "µm").replace("^2", "²")
     return f"{words} [{unit}]" if unit else words

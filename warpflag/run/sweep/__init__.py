@@ -6,14 +6,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from warpflag.run.sweep.plan import BadMembers, Sweep, grid_axes, read
+    from warpflag.run.sweep.axes import grid_axes
+    from warpflag.run.sweep.plan import BadMembers, Sweep, read
     from warpflag.run.sweep.sweep import SweepRun, resume, resume_or_start, start
 
 __all__ = ["BadMembers", "Sweep", "SweepRun", "grid_axes", "read", "resume", "resume_or_start", "start"]
 
 # Where each name lives; loaded on first use: a sweep is read without Warp.
 _HOMES = {
-    **dict.fromkeys(("BadMembers", "Sweep", "grid_axes", "read"), "plan"),
+    "grid_axes": "axes",
+    **dict.fromkeys(("BadMembers", "Sweep", "read"), "plan"),
     **dict.fromkeys(("SweepRun", "resume", "resume_or_start", "start"), "sweep"),
 }
 

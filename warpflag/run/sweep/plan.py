@@ -11,6 +11,7 @@ A sweep file:
     [axes]                                # all combinations
     motor.torque = { from = 0.4, to = 3.4, count = 8 }    # spacing = "log": equal ratios
     flagella.opening_angle = [23, 44, 90]
+    "motor.knee, motor.no_load" = [[100, 200], [175, 300]]  # these two together
 
     [random]
     seed = 1
@@ -24,8 +25,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,18 +32,15 @@ from typing import Any
 
 import numpy as np
 
-from warpflag.run.sweep import draws
+from warpflag.run.sweep import axes, draws
 from warpflag.scene import Scene, SceneError, dumps, load, with_values
 from warpflag.scene.errors import MOST_PROBLEMS, written
-from warpflag.scene.reading import check_key, is_whole
 from warpflag.scene.scene_file import nearest, read_overrides, read_toml
 
-__all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "grid_axes", "read"]
+__all__ = ["BASE_NAME", "BadMembers", "Member", "Sweep", "check_members", "read"]
 
 BASE_NAME = "base.toml"
 _SWEEP_KEYS = ("base", "name", "repeats", "set", "axes", "random")
-_MOST_MEMBERS = 1_000_000  # of a sweep: more is a slip in its axes, and their scenes would take gigabytes
-_OUTER_COMMA = re.compile(r",(?![^\[]*\])")  # one that is not within brackets
 
 
 class BadMembers(ValueError):
@@ -101,7 +97,8 @@ class Sweep:
     Attributes:
         base: the scene that all members share but for their values.
         axes: values by dotted key, or from, to, count and spacing; the members are all combinations, the last axis
-            fastest. None takes a value of the base away. What is given as arrays of NumPy is kept as lists.
+            fastest. "key, other": lists of values of keys that vary together. None takes a value of the base away. What
+            is given as arrays of NumPy is kept as lists.
         random: as the table [random] of a sweep file, dotted keys flat.
         repeats: of every combination and draw.
         name: of the sweep's directory; empty: that of the base.
@@ -124,9 +121,9 @@ class Sweep:
             if not isinstance(given, Mapping):
                 raise SceneError(name, _plain(given), "must be values by dotted key")
             object.__setattr__(self, name, {str(key): _plain(value) for key, value in given.items()})
-        axes = {key: _axis(f"axes.{key}", values) for key, values in self.axes.items()}
-        object.__setattr__(self, "axes", axes)
-        object.__setattr__(self, "repeats", _count("repeats", _plain(self.repeats)))
+        named = {", ".join(axes.keys_of(axis)): values for axis, values in self.axes.items()}
+        object.__setattr__(self, "axes", {axis: axes.values_of(f"axes.{axis}", own) for axis, own in named.items()})
+        object.__setattr__(self, "repeats", axes.count("repeats", _plain(self.repeats)))
         object.__setattr__(self, "name", self.name or self.base.name)
         with_values(self.base, {"name": self.name})  # whether it can be one
 
@@ -137,20 +134,20 @@ class Sweep:
             BadMembers: some scenes can't be simulated; one line for each.
             SceneError: the sweep itself is not sound.
         """
-        for key, values in self.axes.items():
-            _check_axis(key, list(values))
+        axes.check(self.axes)
+        varied = axes.values_by_key(self.axes)
         random = draws.Draws(self.random, self.base)
         repeats = self.repeats
-        noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in {*self.axes, *self.random}
-        seeded = noise or "markov" in (self.base.motor.switching, *self.axes.get("motor.switching", ()))
+        noise = self.base.fluid.temperature > 0.0 or "fluid.temperature" in {*varied, *self.random}
+        seeded = noise or "markov" in (self.base.motor.switching, *varied.get("motor.switching", ()))
         if repeats > 1 and not random.differs_in_repeats and not seeded:
             problem = "would be the same run again and again: nothing is random in a repeat"
             raise SceneError("repeats", repeats, problem, ["random"])
         if random.count > 1 and not (random.differs or seeded):
             raise SceneError("random.draws", random.count, "would be the same run again and again: nothing is drawn")
         size = repeats * random.count * int(np.prod([len(values) for values in self.axes.values()], dtype=float))
-        if size > _MOST_MEMBERS:
-            raise SceneError("axes", list(self.axes), f"make {size} members; at most {_MOST_MEMBERS} are allowed")
+        if size > axes.MOST_MEMBERS:
+            raise SceneError("axes", list(self.axes), f"make {size} members; at most {axes.MOST_MEMBERS} are allowed")
         members: list[Member] = []
         bad: dict[str, SceneError] = {}
         width = max(4, len(str(size - 1)))
@@ -172,12 +169,16 @@ class Sweep:
         self, random: draws.Draws, combination: Sequence[Any], draw: int, repeat: int, name: str
     ) -> tuple[dict[str, Any], Scene]:
         """The values of one member by dotted key, and its scene."""
-        axes, named = dict(zip(self.axes, combination, strict=True)), {"name": name}
-        scene = with_values(self.base, axes | named)
+        own: dict[str, Any] = {}
+        for axis, value in zip(self.axes, combination, strict=True):
+            own |= axes.point(axis, value)
+        named = {"name": name}
+        scene = with_values(self.base, own | named)
         drawn = random.values(scene, draw, repeat)
-        for key in axes.keys() & drawn.keys():
-            raise SceneError(f"axes.{key}", list(self.axes[key]), "is drawn at random, too: leave out one of both")
-        values = axes | drawn
+        for key in own.keys() & drawn.keys():
+            values = axes.values_by_key(self.axes)[key]
+            raise SceneError(f"axes.{key}", values, "is drawn at random, too: leave out one of both")
+        values = own | drawn
         return values, with_values(self.base, values | named) if drawn else scene
 
     def first_scene(self) -> Scene | None:
@@ -206,7 +207,7 @@ def read(path: str | Path, overrides: Sequence[str] = (), grid: Sequence[str] = 
     Args:
         path: of a sweep file or a scene file.
         overrides: "key=value" texts that replace values of the base scene.
-        grid: axes as in `grid_axes`; they replace those of the same key.
+        grid: axes as in `axes.grid_axes`; they replace those of the same key.
 
     Raises:
         SceneError: a file can't be read or holds what is not allowed.
@@ -214,17 +215,17 @@ def read(path: str | Path, overrides: Sequence[str] = (), grid: Sequence[str] = 
     path = Path(path)
     table = read_toml(path)
     try:
-        axes = grid_axes(grid)
+        given = axes.grid_axes(grid)
         if not {"base", "axes"} & table.keys():
             base = load(path, overrides)
-            _refuse_axes(axes, overrides)
-            return Sweep(base, axes, name=base.name)
-        return _built(path, table, overrides, axes)
+            axes.refuse_overrides(given, overrides)
+            return Sweep(base, given, name=base.name)
+        return _built(path, table, overrides, given)
     except SceneError as error:
         raise (error if error.source else error.located(path)) from None
 
 
-def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes: Mapping[str, list[Any]]) -> Sweep:
+def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], grid: Mapping[str, list[Any]]) -> Sweep:
     for key in table.keys() - set(_SWEEP_KEYS):
         near = nearest(key, _SWEEP_KEYS)
         hint = f"did you mean {near}?" if near else "known here: " + ", ".join(_SWEEP_KEYS)
@@ -235,78 +236,15 @@ def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], axes:
     for key in ("set", "axes", "random"):
         if not isinstance(table.get(key, {}), dict):
             raise SceneError(key, table[key], f"must be a table [{key}]")
-    given = _flat(table.get("axes", {}))
-    found = {key: _axis(f"axes.{key}", values) for key, values in given.items()} | dict(axes)
-    _refuse_axes(found, overrides)
+    given = {", ".join(axes.keys_of(axis)): values for axis, values in _flat(table.get("axes", {})).items()}
+    found = {axis: axes.values_of(f"axes.{axis}", values) for axis, values in given.items()} | dict(grid)
+    axes.refuse_overrides(found, overrides)
     name = table.get("name", path.stem)
     if not isinstance(name, str):
         raise SceneError("name", name, "must be a text")
     scene = load(path.parent / base, {**_flat(table.get("set", {})), **read_overrides(overrides)})
     scene = with_values(scene, {"name": name})
-    return Sweep(scene, found, _flat(table.get("random", {})), _count("repeats", table.get("repeats", 1)), name)
-
-
-def _refuse_axes(axes: Iterable[str], overrides: Sequence[str]) -> None:
-    """That no value of the command line is one that an axis would replace in every member."""
-    for key, value in read_overrides(overrides).items():
-        if key in axes:
-            problem = f"is an axis of the sweep as well; --grid {key}={written(value)} takes the place of that axis"
-            raise SceneError(key, value, problem, source="--set")
-
-
-def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
-    """Axes from the command line: "key=from:to:count", "key=from:to:count:log", or "key=a,b,c".
-
-    Raises:
-        SceneError: an argument has another form.
-    """
-    axes: dict[str, list[Any]] = {}
-    for argument in arguments:
-        key, sign, text = argument.partition("=")
-        parts = text.split(":")
-        try:
-            if not sign or not key or len(parts) not in (1, 3, 4):
-                raise ValueError
-            if len(parts) > 1:
-                table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
-                table |= {"spacing": parts[3]} if len(parts) == 4 else {}
-                found = _axis(key, table)
-            else:
-                items = filter(None, _OUTER_COMMA.split(text))
-                found = [read_overrides([f"{key}={item}"])[key] for item in items]
-        except ValueError as error:
-            if isinstance(error, SceneError):
-                raise error.located("--grid") from None
-            problem = "must be written key=from:to:count, key=from:to:count:log or key=a,b,c"
-            raise SceneError(key, text, problem, source="--grid") from None
-        if not found:
-            raise SceneError(key, text, "has no values", source="--grid")
-        if key in axes:
-            raise SceneError(key, text, "is given twice", source="--grid")
-        axes[key] = found
-    return axes
-
-
-def _axis(key: str, values: Any) -> list[Any]:
-    """The values of an axis: a list, or from, to, count and perhaps spacing."""
-    if isinstance(values, list) and values:
-        return values
-    if isinstance(values, dict) and values.keys() | {"spacing"} == {"from", "to", "count", "spacing"}:
-        ends, spacing = [values["from"], values["to"]], values.get("spacing", "linear")
-        if spacing not in ("linear", "log"):
-            raise SceneError(f"{key}.spacing", spacing, "must be one of linear, log")
-        if not all(isinstance(end, int | float) and not isinstance(end, bool) and np.isfinite(end) for end in ends):
-            raise SceneError(key, values, "must have finite numbers as from and to")
-        if values["count"] == 1 and ends[0] != ends[1]:
-            raise SceneError(f"{key}.count", 1, "must be 2 or more where from and to differ")
-        if spacing == "log" and min(ends) <= 0.0:
-            raise SceneError(key, values, "must have from and to above 0 where spacing is log")
-        spaced = np.geomspace if spacing == "log" else np.linspace
-        found = [float(value) for value in spaced(ends[0], ends[1], _count(f"{key}.count", values["count"]))]
-        if is_whole(key.removeprefix("axes.")):
-            return [round(value) if math.isclose(value, round(value), rel_tol=1e-12) else value for value in found]
-        return found
-    raise SceneError(key, values, "must be a list of values, or { from = , to = , count = }")
+    return Sweep(scene, found, _flat(table.get("random", {})), axes.count("repeats", table.get("repeats", 1)), name)
 
 
 def _with_seeds(members: list[Member]) -> list[Member]:
@@ -327,30 +265,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Iterable) and not isinstance(value, str | bytes):
         return [_plain(item) for item in value]
     return "absent" if value is None else value
-
-
-def _check_axis(key: str, values: list[Any]) -> None:
-    """That scenes have the key of an axis, and that no two of its values make the same members.
-
-    Raises:
-        SceneError: they have it not, or they do.
-    """
-    check_key(key, values)
-    if key == "name":
-        raise SceneError(f"axes.{key}", values, "is no axis: members are named after the sweep and their numbers")
-    found: set[str] = set()
-    for value in values:
-        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-        text = written(float(value) if number else value)
-        if text in found:
-            raise SceneError(f"axes.{key}", values, f"has {text} twice, which makes the same members twice")
-        found.add(text)
-
-
-def _count(key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= _MOST_MEMBERS:
-        raise SceneError(key, value, f"must be a whole number, 1 to {_MOST_MEMBERS}")
-    return value
 
 
 _SPREAD_KEYS = {"from", "to", "low", "high", "mean", "deviation"}  # of a table that says what a value may be
