@@ -205,6 +205,9 @@ def _started(options: argparse.Namespace) -> Run:
 
 def _check(options: argparse.Namespace) -> int:
     if options.scene.endswith((".usd", ".usda", ".usdc", ".usdz")):
+        for option, value in (("--device", options.device), ("--precision", options.precision), ("--set", options.set)):
+            if value:
+                return tell(f"{option} is of scenes, and {options.scene} is a movie", BAD_INPUT)
         return _check_movie(options.scene)
     scene = _scene(options)
     from warpflag.run.check import report

@@ -198,6 +198,9 @@ def test_check_tells_what_is_wrong_with_a_movie(record, tmp_path, capsys, monkey
     assert cli.main(["export", "run", "--to", "usd", "-o", "movie.usda"]) == 0
     assert cli.main(["check", "movie.usda"]) == 0
     assert capsys.readouterr().out.endswith("movie.usda: plays\n")
+    for option in (["--set", "frames=2"], ["--device", "cpu"], ["--precision", "float32"]):
+        assert cli.main(["check", "movie.usda", *option]) == 2
+        assert capsys.readouterr().err == f"warpflag: {option[0]} is of scenes, and movie.usda is a movie\n"
     Path("movie.usda").write_text(Path("movie.usda").read_text().replace("catmullRom", "catmulRom"))
     assert cli.main(["check", "movie.usda"]) == 2
     assert "catmulRom" in capsys.readouterr().out
