@@ -44,8 +44,8 @@ def test_joints_flip_at_times_that_neither_accuracy_nor_stepper_changes(values, 
 
     In the second scene, of a front ten times as fast as real ones, three joints flip to and fro, one of them back at
     the end of its ramp, just before the moment for that has gone. Looking at the ends of steps alone, or letting a
-    joint wait for a neighbour that it does not follow, sets other joints going: poses differ by up to a thousand times
-    the accuracy.
+    joint wait for a neighbour that it does not follow, sets other joints going: poses differ by hundreds to thousands
+    of times the accuracy.
     """
     found = {}
     for stepper in STEPPERS[precision]:

@@ -189,6 +189,11 @@ def is_whole(key: str) -> bool:
     return setting is not None and setting.kind == "integer"
 
 
+def keys_of(text: str) -> list[str]:
+    """Dotted keys with commas between them, as those that vary together along an axis of a sweep."""
+    return [key.strip() for key in text.split(",")]
+
+
 def unit_of(key: str) -> str:
     """The unit of a dotted key's numbers, as in "pN s/um^2"; empty where they have none, or no scene has the key."""
     setting = _setting(key)

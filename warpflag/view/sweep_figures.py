@@ -16,7 +16,7 @@ import numpy as np
 
 from warpflag.base.output import OutputError, missing, text_of_file
 from warpflag.observables.arrays import Array
-from warpflag.scene.reading import unit_of
+from warpflag.scene.reading import keys_of, unit_of
 from warpflag.view.figures import COLORS, COLUMN, STYLE, TWO_COLUMNS
 from warpflag.view.labels import in_equal_ratios, set_levels, told_apart, with_error, with_margin
 
@@ -152,13 +152,12 @@ def read(directory: str | Path) -> Table:
     if not isinstance(axes, dict):
         raise OutputError(f"{path.with_name('sweep.toml')}: axes is no table of values by key")
     columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
-    leading = [key for axis in axes for key in _leading(axis.split(","), columns)]
+    leading = [key for axis in axes for key in _leading([key for key in keys_of(axis) if key in columns], columns)]
     return Table(Path(directory).resolve().name, tuple(leading), columns)
 
 
 def _leading(keys: list[str], columns: dict[str, list[str]]) -> list[str]:
     """Of keys that vary together the first one that tells all their points apart; all of them where none does."""
-    keys = [key.strip() for key in keys if key.strip() in columns]
     points = len(set(zip(*(columns[key] for key in keys), strict=True)))
     alone = [key for key in keys if len(set(columns[key])) == points]
     return alone[:1] or keys

@@ -64,6 +64,7 @@ def test_motors_that_switch_along_such_an_axis_have_random_repeats(folder):
             TOGETHER + "motor.knee = [100]",
             "motor.knee, which is in another axis as well, motor.knee, motor",
         ),
+        (TOGETHER + '"motor.knee,motor.no_load" = [[100, 250]]', "axes.motor.knee, motor.no_load = .* is given twice"),
         ('"motor.knee, " = [[100, 200]]', "has no key before or after a comma"),
         ('"motor.knee, motor.nope" = [[100, 200]]', "motor.nope = .*unknown key"),
         ('"motor.knee, motor.no_load" = [[100, 200], [100, 200]]', "twice, which makes the same members twice"),

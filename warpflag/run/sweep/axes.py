@@ -16,28 +16,28 @@ import numpy as np
 
 from warpflag.scene import SceneError
 from warpflag.scene.errors import written
-from warpflag.scene.reading import check_key, is_whole
+from warpflag.scene.reading import check_key, is_whole, keys_of
 from warpflag.scene.scene_file import read_overrides
 
-__all__ = [
-    "MOST_MEMBERS",
-    "check",
-    "count",
-    "grid_axes",
-    "keys_of",
-    "point",
-    "refuse_overrides",
-    "values_by_key",
-    "values_of",
-]
+__all__ = ["MOST_MEMBERS", "check", "count", "grid_axes", "named", "point", "refuse_overrides", "values_by_key"]
 
 MOST_MEMBERS = 1_000_000  # of a sweep: more is a slip in its axes, and their scenes would take gigabytes
 _OUTER_COMMA = re.compile(r",(?![^\[]*\])")  # one that is not within brackets
 
 
-def keys_of(axis: str) -> list[str]:
-    """Dotted keys that vary along an axis."""
-    return [key.strip() for key in axis.split(",")]
+def named(given: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """The values of all axes, each by its keys with a comma and a space between them.
+
+    Raises:
+        SceneError: an axis is given twice, or its values are of another form.
+    """
+    found: dict[str, list[Any]] = {}
+    for axis, values in given.items():
+        name = ", ".join(keys_of(axis))
+        if name in found:
+            raise SceneError(f"axes.{name}", values, "is given twice")
+        found[name] = _values(f"axes.{name}", values)
+    return found
 
 
 def point(axis: str, value: Any) -> dict[str, Any]:
@@ -90,9 +90,9 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
             if len(parts) > 1:
                 table = {"from": float(parts[0]), "to": float(parts[1]), "count": int(parts[2])}
                 table |= {"spacing": parts[3]} if len(parts) == 4 else {}
-                found = values_of(key, table)
+                found = _values(key, table)
             elif len(keys_of(key)) > 1:
-                found = values_of(key, read_overrides([f"{key}=[{text}]"])[key])
+                found = _values(key, read_overrides([f"{key}=[{text}]"])[key])
             else:
                 items = filter(None, _OUTER_COMMA.split(text))
                 found = [read_overrides([f"{key}={item}"])[key] for item in items]
@@ -109,7 +109,7 @@ def grid_axes(arguments: Sequence[str]) -> dict[str, list[Any]]:
     return axes
 
 
-def values_of(key: str, values: Any) -> list[Any]:
+def _values(key: str, values: Any) -> list[Any]:
     """The values of an axis: a list, or from, to, count and perhaps spacing."""
     together = len(keys_of(key.removeprefix("axes.")))
     if isinstance(values, list) and values:

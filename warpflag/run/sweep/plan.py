@@ -121,8 +121,7 @@ class Sweep:
             if not isinstance(given, Mapping):
                 raise SceneError(name, _plain(given), "must be values by dotted key")
             object.__setattr__(self, name, {str(key): _plain(value) for key, value in given.items()})
-        named = {", ".join(axes.keys_of(axis)): values for axis, values in self.axes.items()}
-        object.__setattr__(self, "axes", {axis: axes.values_of(f"axes.{axis}", own) for axis, own in named.items()})
+        object.__setattr__(self, "axes", axes.named(self.axes))
         object.__setattr__(self, "repeats", axes.count("repeats", _plain(self.repeats)))
         object.__setattr__(self, "name", self.name or self.base.name)
         with_values(self.base, {"name": self.name})  # whether it can be one
@@ -236,8 +235,7 @@ def _built(path: Path, table: Mapping[str, Any], overrides: Sequence[str], grid:
     for key in ("set", "axes", "random"):
         if not isinstance(table.get(key, {}), dict):
             raise SceneError(key, table[key], f"must be a table [{key}]")
-    given = {", ".join(axes.keys_of(axis)): values for axis, values in _flat(table.get("axes", {})).items()}
-    found = {axis: axes.values_of(f"axes.{axis}", values) for axis, values in given.items()} | dict(grid)
+    found = axes.named(_flat(table.get("axes", {}))) | dict(grid)
     axes.refuse_overrides(found, overrides)
     name = table.get("name", path.stem)
     if not isinstance(name, str):
