@@ -344,6 +344,16 @@ def test_a_run_after_compile_compiles_nothing(tmp_path, monkeypatch):
     assert set((tmp_path / "cache").glob("**/*.o")) == built
 
 
+def test_compile_keeps_bytecode_where_python_does_not(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(sys, "pycache_prefix", str(tmp_path / "bytecode"))
+    Path("small.toml").write_text(SMALL)
+    assert cli.main(["compile", "small.toml", "--device", "cpu"]) == 0
+    kept = {path.name.split(".")[0] for path in (tmp_path / "bytecode").glob("**/*.pyc")}
+    assert {"cli", "simulation", "right_hand_side"} <= kept
+
+
 def test_devices_lists_the_cpu(capsys):
     assert cli.main(["devices"]) == 0
     assert any(line.split()[0] == "cpu" for line in capsys.readouterr().out.splitlines())

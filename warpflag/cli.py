@@ -129,7 +129,8 @@ def _parser() -> argparse.ArgumentParser:
     build = commands.add_parser(
         "compile",
         help="compile the kernels that scenes need",
-        description="Fills Warp's kernel cache (WARP_CACHE_PATH) for scenes, so that no run has to wait for it.",
+        description="Fills Warp's kernel cache (WARP_CACHE_PATH) for scenes, so that no run has to wait for it, and "
+        "keeps the bytecode of warpflag's modules, which Python does not where PYTHONDONTWRITEBYTECODE is set.",
     )
     build.add_argument("scenes", nargs="*", metavar="SCENE.toml", help="default: a scene of defaults")
     build.add_argument("--device", help="cpu, cuda:0, ... (see warpflag devices)")
@@ -221,6 +222,9 @@ def _check(options: argparse.Namespace) -> int:
 
 
 def _compile(options: argparse.Namespace) -> int:
+    import compileall
+    import importlib
+
     from warpflag.run.simulation import Simulation
     from warpflag.scene import Scene, load
 
@@ -228,6 +232,9 @@ def _compile(options: argparse.Namespace) -> int:
         simulation = Simulation(scene, device=options.device)
         simulation.prepare(recording=True)
         print(f"{scene.name}: kernels are compiled")
+    for package in ("warpflag", "warpflag_kernels"):
+        for folder in importlib.import_module(package).__path__:
+            compileall.compile_dir(folder, quiet=2)
     return DONE
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +13,6 @@ from warpflag.run.sweep.table import status_of
 from warpflag.scene import Scene
 
 __all__ = ["Batch", "cut", "groups", "share"]
-
-_INVERSE_GOLDEN_RATIO = (5.0**0.5 - 1.0) / 2.0  # its multiples modulo 1 lie most evenly
 
 
 @dataclass(frozen=True)
@@ -54,16 +51,15 @@ def groups(scenes: Sequence[Scene], directories: Sequence[Path], pending: Sequen
 def cut(group: Sequence[int], size: int) -> list[list[int]]:
     """A group in batches of at most so many members, as equal as they can be.
 
-    Members along an axis take more and more time, or every second takes more, so that neighbours go to different
-    batches: in the order of the multiples of the inverse golden ratio modulo 1, a stretch holds members from
-    everywhere.
+    Members along an axis take more and more time, or every second takes more. So each batch takes one of every few
+    neighbours, and their order is reversed from round to round: 0, 1, 2, 2, 1, 0, 0, 1, ...
     """
     count = math.ceil(len(group) / size)
-    if size == 1:
-        return [[k] for k in group]
-    order = sorted(range(len(group)), key=lambda i: i * _INVERSE_GOLDEN_RATIO % 1.0)
-    ends = [len(group) * k // count for k in range(count + 1)]
-    return [sorted(group[i] for i in order[first:last]) for first, last in itertools.pairwise(ends)]
+    turns = [*range(count), *reversed(range(count))]
+    own: list[list[int]] = [[] for _ in range(count)]
+    for k, member in enumerate(group):
+        own[turns[k % len(turns)]].append(member)
+    return own
 
 
 def share(count: int, workers: int, largest: int) -> int:
