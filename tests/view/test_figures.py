@@ -103,6 +103,45 @@ def test_a_dashboard_draws_everything_known_of_a_run(tmp_path):
     np.testing.assert_array_equal(compared.get_lines()[0].get_ydata(), mean)  # of what each flagellum has by itself
 
 
+PANELS = {  # of every observable: its title in figures, and how many lines a cell with two flagella has
+    "phase_difference": (THETA, 1),
+    "bundle_length": (LENGTH, 1),
+    "steric_force_density": (FORCE, 1),
+    "body_speed": ("swimming speed $v$ (µm/s)", 1),
+    "motor_rate": ("motor rate (Hz), a line per flagellum", 2),
+    "motor_torque": ("motor torque (pN µm), a line per flagellum", 2),
+    "motor_drive": ("motor drive, a line per flagellum", 2),
+    "target_form_share": ("share in the target form, each", 2),
+    "body_rate": ("body rate (Hz)", 1),
+    "elastic_energy": ("elastic energy (pN µm)", 1),
+}
+
+
+def test_every_observable_is_drawn_as_it_was_recorded_in_the_panel_that_names_it(tmp_path):
+    random, counts = np.random.default_rng(1), {name: count for name, (_, count) in PANELS.items()}
+    measured = {name: random.uniform(0.1, 1.0, (9, count)) for name, count in counts.items()}
+    with made_record(tmp_path / "made", 9, scene=paper_scene(name="two")) as record:
+        recorder = Recorder(tmp_path / "run.h5")
+        sizes = {"filament_radius": 0.01, "body_length": 2.5, "body_width": 0.8}
+        recorder.start(record.scene_text, record.first_node, **sizes)
+        for k in range(9):
+            own = {name: values[k] if counts[name] > 1 else float(values[k, 0]) for name, values in measured.items()}
+            recorder.write(replace(record.frame(k), observables=own, forms=None))
+        recorder.close()
+        measured["bundle_length"] = bundle_length(record.positions[:], record.first_node, gap=1.0)[:, None]
+    figure = figures.dashboard(tmp_path)
+    assert set(panels_of(figure)) == {title for title, _ in PANELS.values()}
+    compared = panels_of(figures.comparison([tmp_path], list(PANELS)))
+    for name, (title, count) in PANELS.items():
+        lines = panels_of(figure)[title].get_lines()
+        assert len(lines) == count
+        for line, values in zip(lines, measured[name].T, strict=True):
+            np.testing.assert_allclose(line.get_xdata(), 0.05 * np.arange(9), atol=1e-12)  # ms
+            np.testing.assert_allclose(line.get_ydata(), values)
+        (line,) = compared[title.partition(", ")[0]].get_lines()
+        np.testing.assert_allclose(line.get_ydata(), measured[name].mean(axis=1))
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_runs_of_unequal_length_are_compared_to_the_end_of_the_longest(order, tmp_path):
     made_record(tmp_path, 12).close()

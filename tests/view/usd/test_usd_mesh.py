@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdShade  # noqa: TID253 (no command line starts here)
 
-from tests.films import FIRST_NODE, made_record
+from tests.films import FIRST_NODE, THREE, made_record
 from tests.view.usd.stages import at, faults
 from warpflag import cli
 from warpflag.base.output import OutputError
-from warpflag.view.coloring import BODY_COLOR, DISPLAY_RADIUS, FLAGELLUM_COLORS, QUANTITIES, linear
+from warpflag.scene import with_values
+from warpflag.view.coloring import BODY_COLOR, DISPLAY_RADIUS, FLAGELLUM_COLORS, QUANTITIES, Coloring, linear
 from warpflag.view.render import render
 from warpflag.view.usd import Shot, movie_stage, write_movie
 
@@ -107,18 +108,24 @@ def test_materials_have_the_colours_themselves(movie):
         np.testing.assert_allclose(UsdGeom.Mesh(prim).GetDisplayColorAttr().Get()[0], linear(color), atol=1e-6)
 
 
-def test_colours_of_a_quantity_are_those_of_the_nearest_node(movie):
-    record, _ = movie
-    shots = Shot(color_by="curvature", mesh=True), Shot(color_by="curvature")
-    meshes, curves = (movie_stage(record, shot) for shot in shots)
-    expected = np.array(UsdGeom.BasisCurves(at(curves, "/World/Cell/Flagella")).GetDisplayColorAttr().Get(5))
+@pytest.mark.parametrize("color_by", ["curvature", "form"])
+def test_colours_and_values_of_a_quantity_are_those_of_the_nearest_node(color_by, tmp_path):
+    record = made_record(tmp_path, scene=with_values(THREE, {"polymorphs.enabled": True}))  # forms change by the frame
+    meshes, curves = (movie_stage(record, Shot(color_by=color_by, mesh=mesh)) for mesh in (True, False))
+    flagella = UsdGeom.BasisCurves(at(curves, "/World/Cell/Flagella"))
     mesh = UsdGeom.Mesh(at(meshes, "/World/Cell/Flagella/Flagellum_1"))
-    vertices, colors = (np.array(a.Get(5)) for a in (mesh.GetPointsAttr(), mesh.GetDisplayColorAttr()))
-    nodes = record.positions[5][FIRST_NODE[1] : FIRST_NODE[2]]
-    distances = np.linalg.norm(vertices[:, None] - nodes, axis=-1)
-    on_ring = distances.min(axis=1) < 1.01 * DISPLAY_RADIUS
-    nearest = distances.argmin(axis=1)[on_ring]
-    np.testing.assert_allclose(colors[on_ring], expected[FIRST_NODE[1] : FIRST_NODE[2]][nearest], atol=1e-6)
+    own = slice(FIRST_NODE[1], FIRST_NODE[2])
+    for frame in (0, 5, 11):
+        vertices = np.array(mesh.GetPointsAttr().Get(frame))
+        distances = np.linalg.norm(vertices[:, None] - record.positions[frame][own], axis=-1)
+        on_ring = distances.min(axis=1) < 1.01 * DISPLAY_RADIUS
+        nearest = distances.argmin(axis=1)[on_ring]
+        for read in (
+            lambda prim: prim.GetDisplayColorAttr(),
+            lambda prim: UsdGeom.PrimvarsAPI(prim).GetPrimvar(Coloring(color_by, record, THREE).primvar),
+        ):
+            shown, expected = (np.array(read(prim).Get(frame)) for prim in (mesh, flagella))
+            np.testing.assert_allclose(shown[on_ring], expected[own][nearest], atol=1e-6)
 
 
 def test_command_writes_meshes_which_are_not_drawn_from(tmp_path, monkeypatch, capsys):
