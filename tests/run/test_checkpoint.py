@@ -13,6 +13,7 @@ import pytest
 
 from tests.runs import arrays, assert_same_frames, ended_at, executed, small
 from warpflag import cli
+from warpflag.base.device import DeviceError
 from warpflag.run import checkpoint, run
 from warpflag.run.carried_values import ALLOWED
 from warpflag.run.run_directory import RunError
@@ -213,6 +214,9 @@ def test_a_checkpoint_holds_nothing_outside_the_table(each_half):
         ("chart.base_tangent", 0.0),
         ("chart.base_director", 2.0),
         ("chart.base_body_orientation", 2.0),
+        ("frame.before_tangent", 0.0),
+        ("frame.before_director", 2.0),
+        ("frame.before_body_orientation", 2.0),
     ],
 )
 def test_a_forged_value_is_refused_and_the_record_stays(half, name, value, tmp_path):
@@ -253,6 +257,13 @@ def test_a_wall_time_that_is_none_is_refused(half, wall_time, tmp_path):
     directory = forged(half, tmp_path, lambda held: None, lambda meta: meta.update(wall_time=wall_time))
     with pytest.raises(checkpoint.CheckpointError):
         run.resume(str(directory))
+
+
+def test_a_run_goes_on_on_the_device_that_it_ran_on_unless_another_is_named(half, tmp_path):
+    directory = forged(half, tmp_path, lambda held: None, lambda meta: meta.update(device="cuda:63"))
+    with pytest.raises(DeviceError, match="cuda:63"):
+        run.resume(str(directory))
+    assert run.resume(str(directory), device="cpu").execute(quiet=True).status == "done"
 
 
 def test_the_command_ends_with_status_2(half, tmp_path, capsys):

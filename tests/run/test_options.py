@@ -138,6 +138,8 @@ ROWS: list[tuple[str, str, str, str | Callable[[Found], Any], Any]] = [
     ("render --follow", f"{RENDER} --color form", "--follow", "drawn.shot.follow", True),
     ("render --fps", RENDER, "--fps 10", "drawn.frames_per_second", 10.0),
     ("render --slow-down", f"{RENDER} --follow", "--slow-down 9", "drawn.shot.slow_down", 9.0),
+    ("render --slow-down", RENDER, "--slow-down 9", "drawn.shot.slow_down", 9.0),
+    ("render --follow", RENDER, "--follow", "drawn.shot.follow", True),
     ("export --to", EXPORT, "--to csv", lambda found: "csv" in found, True),
     ("export -o", EXPORT, "-o b.usda", "filmed.path", Path("b.usda")),
     ("export -o", "export one --to html", "-o b.html", "page.path", Path("b.html")),

@@ -181,6 +181,17 @@ def test_steppers_take_the_same_noise(device):
     assert abs(ends[2] - ends[1]).max() < 0.05 * abs(ends[1]).max()
 
 
+def test_explicit_steps_are_shares_of_the_longest_sound_step(device):
+    """With noise a twentieth of it, and 0.11 of it where two stages leave less of an error; implicit ones are 1 us."""
+    cold = cell({"numerics.stepper": "euler"})
+    (longest,) = Simulation(cold, device=device).system.control.longest_step.numpy()
+    for stepper, expected in (("euler", 0.05 * longest), ("rkc", 0.11 * longest), ("implicit", 1e-6)):
+        warm = with_values(cold, {"numerics.stepper": stepper, "fluid.temperature": 300.0})
+        for given in (None, 2e-7):
+            sim = Simulation(with_values(warm, {"numerics.time_step": given}), device=device)
+            assert sim.system.control.longest_step.numpy() == pytest.approx(expected if given is None else given)
+
+
 def test_two_stages_are_of_second_order(device):
     """Of a disturbed cell, at a temperature that moves nothing; Euler's error is some thirty times as large."""
     cold = {"fluid.temperature": 1e-12, "hydrodynamics.mode": "all", "motor.torque": 3.4, "flagella.length": 0.6}

@@ -1,12 +1,16 @@
 """Thermal velocities of a step: their covariance is that of the dense mobility, their mean kT times its divergence."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import warp as wp
 from warpflag_kernels.base.types import structs
+from warpflag_kernels.contact import contact_list, search
 from warpflag_kernels.fluid import lanczos, lanczos_space, noise
+from warpflag_kernels.implicit import delassus
 from warpflag_kernels.rod import elastic, forces, hessian
-from warpflag_kernels.thermal import strain_gradients
+from warpflag_kernels.thermal import equilibrium, strain_gradients
 
 from tests.bench import Bench
 from tests.helpers import cell, free_nodes, shaken, touching_cell
@@ -243,3 +247,35 @@ def test_random_elastic_force_has_the_covariance_of_the_stiffness(device):
     for direction in np.random.default_rng(1).standard_normal((20, len(moving))):
         variance = direction @ exact @ direction
         assert abs(np.var(found @ direction) / (KT * variance) - 1) < 3.5 * (2 / (count * draws)) ** 0.5
+
+
+def test_random_contact_forces_have_the_variance_of_the_stiffness(device):
+    """Over 4000 draws, each contact by itself, beside the force that acts; none beyond the reach of the law."""
+    count, draws, share, acting = 200, 20, 0.5, 0.3
+    scene = touching_cell({"flagella.length": 0.6, "body.contact": False, "steric.strength": 0.7, **WARM})
+    draw = Draw([with_values(scene, {"fluid.seed": i}) for i in range(count)], None, device)
+    contacts = contact_list.allocate(draw.model, True)
+    law = delassus.allocate(draw.model, contacts)
+    search.find(draw.model, draw.state, draw.state.data.pose, contacts)
+    law.force.fill_(acting)
+    first, own = contacts.first.numpy()[:-1, None], int(contacts.count.numpy()[0])
+    assert (contacts.count.numpy() == own).all()
+    listed = first + np.arange(own)
+    drawn = wp.zeros_like(law.force)
+    found = []
+    for number in range(draws):
+        draw.control.steps.fill_(number)
+        parts = SimpleNamespace(contacts=contacts, law=law, control=draw.control)
+        equilibrium.random_contacts(draw.model, draw.state, parts, draw.stepper.noise, share, drawn)
+        found.append(drawn.numpy()[listed])
+    forces_found = np.concatenate(found)
+    x = contacts.gap.numpy()[listed[0]] / 0.04
+    stiffness = np.where(x < 2 ** (1 / 6), 0.7 / 0.04 * (26 * x**-14 - 7 * x**-8), 0.0)
+    acts = stiffness > 0.0
+    assert acts.sum() > 2 and x.min() > 0.7
+    np.testing.assert_allclose(forces_found[:, ~acts], acting, rtol=1e-6)
+    deviates = (forces_found[:, acts] - acting) / (share * np.sqrt(KT * stiffness[acts]))
+    number = len(deviates)
+    assert abs(deviates.mean(axis=0)).max() < 4 * number**-0.5
+    products = deviates.T @ deviates / number
+    assert abs(products - np.eye(len(products))).max() < 4 * (2 / number) ** 0.5
