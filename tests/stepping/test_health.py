@@ -158,6 +158,16 @@ def test_where_an_advance_ends_is_looked_at_whatever_the_interval(device):
         sim.advance(15 * step)
 
 
+def test_between_the_ends_of_advances_every_so_many_th_step_is_looked_at(device):
+    scene = with_values(cell(), {"numerics.stepper": "euler"})
+    step = 10 * euler_step(scene)
+    sim = Simulation(with_values(scene, {"numerics.time_step": step}), device=device)
+    sim.system.guard.interval.fill_(12)
+    with pytest.raises(NumericalError):
+        sim.advance(15 * step)
+    assert sim.steps.tolist() == [12]
+
+
 def test_the_printed_mobility_bursts_at_contact_and_is_stopped(device):
     """Not positive definite at contact: no step is short enough."""
     for step in (1e-5, 1e-6):
