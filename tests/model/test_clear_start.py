@@ -68,6 +68,36 @@ def test_clear_starts_run(phase, device):
     sim.advance(5e-5)
 
 
+PRESSED = {"flagella.count": 3, "flagella.length": 1.2, "flagella.segment_length": 0.06, "numerics.stepper": "implicit"}
+"""Of the third flagellum node 1 is 0.37 sigma outside the body, which presses on it with more than 1000 pN."""
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({}, "with the phase of flagellum 2 at 250 deg"),
+        ({f"flagellum.{k}.phase": 180.0 + 131.4 * (k == 1) for k in range(3)}, "turning about its anchor flagellum"),
+    ],
+    ids=["other phase", "turned"],
+)
+def test_no_flagellum_starts_pressed_onto_the_body(values, said, device):
+    """The guard of strains does not stop the first steps."""
+    scene = cell({**PRESSED, **values})
+    sim = Simulation(scene, device=device)
+    assert said in " ".join(sim.notes[0])
+    start = starting_state(scene)
+    nodes = np.concatenate([x[1:] for x in start.positions])
+    assert body_gaps(scene, start, nodes).min() > 0.6 * 0.04
+    sim.advance(1e-7)
+
+
+def test_what_starts_pressed_for_want_of_another_place_is_told():
+    """A contact that is wider than the segments are long: node 1 can't leave it."""
+    values = {**PRESSED, "flagella.count": 1, "steric.diameter": 0.15, "steric.strength": 10.0}
+    (*_, note) = starting_state(cell(values)).notes
+    assert note.startswith("starts with node 1 of flagellum 0 pressed by the body with ")
+
+
 def test_a_clear_scene_keeps_its_own_shape():
     scene = cell()
     start, own = starting_state(scene), initial_state(scene)

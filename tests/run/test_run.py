@@ -100,6 +100,7 @@ def test_likely_causes_are_told_the_farthest_from_usual_first():
         "external.body_force = (0.0, 0.0, 1.0)",
     ]
     assert likely_causes(far) == causes
+    assert likely_causes(small({"motor.torque": 0.01})) == []  # a weak motor stops no run
     (soft,) = likely_causes(small({"flagella.stretching_stiffness": 10.0}))
     assert soft == "flagella.stretching_stiffness = 10, 1/100 of the default"
     for apart, said in ((0.1, ["anchors 0.1 um apart crowd the flagella"]), (0.13, [])):  # three diameters are 0.12

@@ -92,6 +92,8 @@ def likely_causes(scene: Scene) -> list[str]:
         ratio = value / usual[key]
         if ratio <= 0.0 or 1 / _NOTABLE_VALUE < ratio < _NOTABLE_VALUE:
             continue
+        if key == "motor.torque" and ratio < 1.0:  # no motion is too hard to follow because its motors are weak
+            continue
         much = f"{ratio:.3g} times" if ratio > 1 else f"1/{1 / ratio:.3g} of"
         found.append((abs(math.log(ratio)), f"{key} = {value:g}, {much} the default"))
     if (apart := _nearest_anchors(scene)) is not None:
