@@ -252,7 +252,7 @@ def test_a_frame_of_another_time_is_refused(half, tmp_path):
         run.resume(str(directory))
 
 
-@pytest.mark.parametrize("wall_time", [float("nan"), -1.0])
+@pytest.mark.parametrize("wall_time", [float("nan"), -1.0, float("inf")])
 def test_a_wall_time_that_is_none_is_refused(half, wall_time, tmp_path):
     directory = forged(half, tmp_path, lambda held: None, lambda meta: meta.update(wall_time=wall_time))
     with pytest.raises(checkpoint.CheckpointError):

@@ -8,7 +8,7 @@ from warpflag_kernels.base import clock
 from warpflag_kernels.stepping.health import Fault, encode
 
 from tests.helpers import cell
-from warpflag.run.faults import NumericalError, found_faults
+from warpflag.run.faults import NumericalError, found_faults, likely_causes
 
 FIXED = {"numerics.time_step": 1e-6}
 
@@ -39,3 +39,9 @@ def test_a_fault_belongs_to_the_flagellum_of_its_element(element, place):
 )
 def test_a_shorter_step_is_advised_once_where_it_is_fixed(kind, values, count):
     assert str(NumericalError(kind, 1e-3, 0, 0, 0, cell(values))).count("take a shorter numerics.time_step") == count
+
+
+def test_the_value_that_is_farthest_from_its_default_is_named_first_whether_above_or_below_it():
+    causes = likely_causes(cell({"motor.torque": 34.0, "fluid.viscosity": 1e-5, "steric.strength": 0.04}))
+    assert [cause.partition(" = ")[0] for cause in causes] == ["fluid.viscosity", "steric.strength", "motor.torque"]
+    assert causes[0].endswith("1/100 of the default") and causes[2].endswith("10 times the default")

@@ -13,6 +13,7 @@ from warpflag import observables
 from warpflag.record import Record
 from warpflag.run import run
 from warpflag.run.faults import NumericalError, likely_causes
+from warpflag.run.member import Member
 from warpflag.scene import dumps, load
 
 
@@ -115,6 +116,31 @@ def test_likely_causes_are_told_the_farthest_from_usual_first():
 def test_the_summary_tells_whether_steps_were_asked_for_their_balance(stepper, judged, tmp_path):
     scene = small({"numerics.stepper": stepper, "duration": 1e-5, "frames": 1})
     assert summary(executed(scene, tmp_path / "made"))["balance"] == {"judged": judged, "violations": 0}
+
+
+@pytest.mark.parametrize(("seconds", "count"), [(0.01, 4), (0.5, 2)])
+def test_checkpoints_take_a_twentieth_of_the_time_at_most(seconds, count, tmp_path, monkeypatch):
+    """Of 32 frames of a second each: every 5 s, and where writing one takes half a second, every 10 s."""
+    clock, saved = [0.0], []
+    written, kept = Member.write, Member.save
+
+    def write(own, frames):
+        clock[0] += 1.0
+        return written(own, frames)
+
+    def save(own, *arguments, **options):
+        clock[0] += seconds
+        saved.append(clock[0])
+        return kept(own, *arguments, **options)
+
+    monkeypatch.setattr("warpflag.run.execute.monotonic", lambda: clock[0])
+    monkeypatch.setattr(Member, "write", write)
+    monkeypatch.setattr(Member, "save", save)
+    with frame_by_frame():
+        executed(small({"frames": 31}), tmp_path / "made")
+    apart = np.diff([0.0, *saved[:-1]])  # the last is of the end
+    assert apart[0] == pytest.approx(6.0 + seconds) and (apart[1:] > 20 * seconds).all()
+    assert len(saved) == count + 1
 
 
 def test_the_last_line_says_how_far_a_run_came(tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from warpflag_kernels.stepping import frame_slots
 
+from tests.films import made_record
 from tests.runs import assert_same_frames, ended_at, executed, frame_by_frame, small
 from warpflag.record import Frame, Record, RecordError
 from warpflag.record.recorder import Recorder
@@ -170,6 +171,22 @@ def test_a_record_that_is_not_finite_is_no_start(what, tmp_path):
     recorder.close()
     with pytest.raises(SceneError, match="not finite"):
         Simulation(small({"start.record": str(tmp_path)}), device="cpu")
+
+
+def test_soft_filaments_may_begin_under_tension_and_stiff_ones_not(tmp_path):
+    """Stretched by 5 % all along, as 5 pN do it to a stiffness of 100 pN, and nothing sound to one of 1000 pN."""
+    with made_record(tmp_path / "made", 1, scene=small()) as record:
+        frame, first_node = record.frame(0), record.first_node
+        anchors = np.repeat(frame.positions[first_node[:-1]], np.diff(first_node), axis=0)
+        recorder = Recorder(tmp_path / "run.h5")
+        recorder.start(record.scene_text, first_node, filament_radius=0.01, body_length=2.5, body_width=0.8)
+        recorder.write(dataclasses.replace(frame, positions=anchors + 1.05 * (frame.positions - anchors)))
+        recorder.close()
+    values = {"start.record": str(tmp_path)}
+    start = Simulation(small({**values, "flagella.stretching_stiffness": 100.0}), device="cpu").state.positions
+    assert np.linalg.norm(start[1] - start[0]) == pytest.approx(0.21)
+    with pytest.raises(SceneError, match=r"segments of 0\.21 um in flagellum 0, the scene's are of 0\.2 um"):
+        Simulation(small(values), device="cpu")
 
 
 @pytest.mark.parametrize(
