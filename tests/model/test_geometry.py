@@ -368,3 +368,12 @@ def test_anchors_may_lie_on_the_caps(offset):
     centre = np.array([0.0, 0.0, math.copysign(0.85, offset)])
     assert anchor[2] == pytest.approx(offset)
     assert np.linalg.norm(anchor - centre) == pytest.approx(0.4)
+
+
+def test_a_flagellum_along_x_has_the_phase_of_one_that_is_hardly_turned_from_there():
+    along, beside = ({"flagella.opening_angle": angle, "flagella.anchor_offset": 0.1} for angle in (180.0, 179.9998))
+    for phase in (0.0, 70.0, 180.0):
+        own = {"flagellum.0.phase": phase, "flagellum.1.phase": phase}
+        one, other = (initial_state(cell({**values, **own})) for values in (along, beside))
+        for x, y in zip(one.positions, other.positions, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-5)

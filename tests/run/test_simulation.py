@@ -173,6 +173,20 @@ def test_a_record_that_is_not_finite_is_no_start(what, tmp_path):
         Simulation(small({"start.record": str(tmp_path)}), device="cpu")
 
 
+@pytest.mark.parametrize(
+    "values", [{"fluid.temperature": 298.0}, {"motor.switching": "markov"}], ids=["noise", "motors"]
+)
+def test_a_seed_may_stay_where_only_one_of_both_runs_draws_from_it(values, tmp_path):
+    for name, made, own in (("first", {}, values), ("then", values, {}), ("both", values, values)):
+        made_record(tmp_path / name, 2, scene=small(made)).close()
+        scene = small({**own, "start.record": str(tmp_path / name)})
+        if name != "both":
+            assert Simulation(scene, device="cpu").times[0] == 0.0
+            continue
+        with pytest.raises(SceneError, match="whose random numbers would come again"):
+            Simulation(scene, device="cpu")
+
+
 def test_soft_filaments_may_begin_under_tension_and_stiff_ones_not(tmp_path):
     """Stretched by 5 % all along, as 5 pN do it to a stiffness of 100 pN, and nothing sound to one of 1000 pN."""
     with made_record(tmp_path / "made", 1, scene=small()) as record:
