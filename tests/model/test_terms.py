@@ -78,9 +78,9 @@ def test_a_term_that_is_off_has_no_stage_no_arrays_and_no_launch(term, monkeypat
             assert (getattr(state, name) is not None) == present, name
 
 
-def test_on_a_cpu_the_right_hand_side_is_one_launch(monkeypatch):
+def test_on_a_cpu_the_forces_of_a_cell_and_their_sums_are_one_launch(monkeypatch):
     scene = cell({"numerics.stepper": "rkc"})
-    parts = {"elastic", "steric", "steric_body", "forces", "body", "mobility"}
+    parts = {"elastic", "steric", "steric_body", "forces", "body", "body_motion"}
     assert not stages_of(launches(scene, monkeypatch, by_cells=True)) & parts
     assert stages_of(launches(scene, monkeypatch)) >= parts
 
@@ -98,8 +98,7 @@ def test_the_pair_sum_is_the_one_asked_for(mode, monkeypatch):
     scene, gathered = cell({"hydrodynamics.mode": mode}), "none" if mode == "none" else "warp"
     assert variants_of(launches(scene, monkeypatch), "mobility") == {f"{mode}_{gathered}"}
     own = "none" if mode == "none" else "symmetric"
-    terms = "motor_elastic_bearing_steric_body_contact"
-    assert variants_of(launches(scene, monkeypatch, by_cells=True), "whole_cell") == {f"{terms}_{mode}_{own}"}
+    assert variants_of(launches(scene, monkeypatch, by_cells=True), "mobility") == {f"{mode}_{own}"}
     model = Simulation(scene, device="cpu").system.model.data
     assert (model.pairs.radius is None) == (mode == "none")
 
@@ -170,7 +169,8 @@ def test_a_bare_scene_loads_a_handful_of_modules(tmp_path):
         "rkc_estimate.float64.fast",
         "reconstruction.float64.fast",
         "chart.float64.fast",
-        "whole_cell.float64.fast.motor_elastic_bearing_none_none",
+        "whole_cell.float64.fast.motor_elastic_bearing",
+        "mobility.float64.fast.none_none",
         "elastic_energy.float64.fast",
         "health.float64.fast",
     }

@@ -99,7 +99,7 @@ class Plan:
         device: Warp's device.
         precision: of positions and forces, and the build.
         pair_precision: of the terms of the Rotne-Prager sum.
-        launch: "cells": one thread takes a whole cell, an explicit right-hand side in one launch; "elements": one
+        launch: "cells": one thread takes a whole cell, all its forces in one launch; "elements": one
             thread for every node, flagellum or cell, stage by stage.
         pair_sum: "symmetric": every pair once for both nodes; "warp" or "thread": pairs gathered at every node, by the
             threads of a warp or by one; "none": no pairs.
@@ -159,7 +159,7 @@ class Plan:
         """The choices in one line, as `warpflag check` prints it."""
         build = "strict build" if self.precision.strict else "fast build"
         pairs = "" if self.pair_precision == self.precision else f" with pairs in {self.pair_precision.name}"
-        launch = "one launch per explicit right-hand side" if self.by_cells else "a launch per stage"
+        launch = "forces of a cell in one launch" if self.by_cells else "a launch per stage"
         sums = "local drag alone"
         if self.pair_sum != "none":
             sums = f"{self.pair_sum} pair sum{pairs}, {self.step_pairs} within an implicit step"

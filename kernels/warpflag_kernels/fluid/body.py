@@ -65,19 +65,17 @@ def mobility(p: Precision, shell: bool | None = None) -> SimpleNamespace:
     return SimpleNamespace(respond=respond)
 
 
-def _variant(terms: tuple[Term, ...], shell: bool) -> str:
-    return variant(terms) + "_shell" * shell
-
-
 @functools.cache
 def functions(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamespace:
     """Device functions: force and torque of one flagellum on the body, and the velocities of one body."""
-    real, vec3 = p.real, p.vec3
-    Model, State = structs(p).Model, structs(p).State
-    on_body, respond = combined(p, terms).on_body, mobility(p, shell).respond
-    module = p.module("body_functions", _variant(terms, shell))
+    return SimpleNamespace(sum_flagellum=_sum(p, terms), move=_motion(p, shell))
 
-    @wp.func(module=module)
+
+@functools.cache
+def _sum(p: Precision, terms: tuple[Term, ...]) -> Any:
+    Model, State, on_body = structs(p).Model, structs(p).State, combined(p, terms).on_body
+
+    @wp.func(module=p.module("body_functions", variant(terms)))
     def sum_flagellum(model: Model, state: State, k: wp.int32):
         first = model.first_node[k]
         through_anchor = state.force[first]
@@ -86,7 +84,15 @@ def functions(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNames
         state.flagellum_force[k] = force
         state.flagellum_torque[k] = torque
 
-    @wp.func(module=module)
+    return sum_flagellum
+
+
+@functools.cache
+def _motion(p: Precision, shell: bool) -> Any:
+    real, vec3 = p.real, p.vec3
+    Model, State, respond = structs(p).Model, structs(p).State, mobility(p, shell).respond
+
+    @wp.func(module=p.module("body_motion_functions", "shell" * shell))
     def move(model: Model, state: State, c: wp.int32):
         force = vec3(real(0.0))
         torque = vec3(real(0.0))
@@ -102,31 +108,13 @@ def functions(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNames
         state.body_velocity[c] = velocity
         state.body_spin[c] = spin
 
-    return SimpleNamespace(sum_flagellum=sum_flagellum, move=move)
+    return move
 
 
 @functools.cache
-def _kernels(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamespace:
-    Model, State = structs(p).Model, structs(p).State
-    f = functions(p, terms, shell)
-    sum_flagellum, move = f.sum_flagellum, f.move
-    module = p.module("body", _variant(terms, shell))
-    settle = combined(p, terms).settle
-    kernels = SimpleNamespace()
-    if settle is not None:
-
-        @wp.kernel(module=module)
-        def settle_all(
-            # Model:
-            model: Model,
-            # Out:
-            state: State,
-        ):
-            c = wp.tid()
-            if state.active[c] != 0:
-                settle(model, state, c)
-
-        kernels.settle = settle_all
+def _sum_kernels(p: Precision, terms: tuple[Term, ...]) -> SimpleNamespace:
+    Model, State, sum_flagellum = structs(p).Model, structs(p).State, _sum(p, terms)
+    module, settle = p.module("body", variant(terms)), combined(p, terms).settle
 
     @wp.kernel(module=module)
     def sum_flagella(
@@ -139,7 +127,28 @@ def _kernels(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamesp
         if state.active[model.cell_of[model.first_node[k]]] != 0:
             sum_flagellum(model, state, k)
 
+    if settle is None:
+        return SimpleNamespace(sum_flagella=sum_flagella)
+
     @wp.kernel(module=module)
+    def settle_all(
+        # Model:
+        model: Model,
+        # Out:
+        state: State,
+    ):
+        c = wp.tid()
+        if state.active[c] != 0:
+            settle(model, state, c)
+
+    return SimpleNamespace(sum_flagella=sum_flagella, settle=settle_all)
+
+
+@functools.cache
+def _motion_kernel(p: Precision, shell: bool) -> Any:
+    Model, State, move = structs(p).Model, structs(p).State, _motion(p, shell)
+
+    @wp.kernel(module=p.module("body_motion", "shell" * shell))
     def move_all(
         # Model:
         model: Model,
@@ -150,18 +159,16 @@ def _kernels(p: Precision, terms: tuple[Term, ...], shell: bool) -> SimpleNamesp
         if state.active[c] != 0:
             move(model, state, c)
 
-    kernels.sum_flagella, kernels.move = sum_flagella, move_all
-    return kernels
+    return move_all
 
 
-def _kernels_of(model: DeviceModel, terms: tuple[Term, ...]) -> SimpleNamespace:
-    of_body = acting(model.precision, terms, "on_body", "settle")
-    return _kernels(model.precision, of_body, model.switches.flows.body)
+def _sums_of(model: DeviceModel, terms: tuple[Term, ...]) -> SimpleNamespace:
+    return _sum_kernels(model.precision, acting(model.precision, terms, "on_body", "settle"))
 
 
 def sum_flagella(model: DeviceModel, state: DeviceState, terms: tuple[Term, ...]) -> None:
     """Force [pN] and torque about the body's centre [pN um] of every flagellum on its body, of these terms."""
-    kernel = _kernels_of(model, terms).sum_flagella
+    kernel = _sums_of(model, terms).sum_flagella
     wp.launch(kernel, model.flagellum_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -187,7 +194,7 @@ def move_bodies(model: DeviceModel, state: DeviceState) -> None:
 
 
 def _move(model: DeviceModel, state: DeviceState) -> None:
-    kernel = _kernels_of(model, model.terms).move
+    kernel = _motion_kernel(model.precision, model.switches.flows.body)
     wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
 
 
@@ -203,9 +210,17 @@ def body_motion(
     """
     terms = model.terms if terms is None else terms
     sum_flagella(model, state, terms)
+    motion_of_sums(model, state, terms, single)
+
+
+def motion_of_sums(
+    model: DeviceModel, state: DeviceState, terms: tuple[Term, ...] | None = None, single: Any = None
+) -> None:
+    """As `body_motion`, where force and torque of every flagellum on its body are known."""
+    terms = model.terms if terms is None else terms
     if model.switches.flows.body:
         obstruct(model, state, single)
     if any(hasattr(term.functions(model.precision), "settle") for term in terms):
-        kernel = _kernels_of(model, terms).settle
+        kernel = _sums_of(model, terms).settle
         wp.launch(kernel, model.cell_count, inputs=[model.data, state.data], device=model.device)
     _move(model, state)

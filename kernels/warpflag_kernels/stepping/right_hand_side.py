@@ -1,8 +1,8 @@
 """The right-hand side: from positions and directors to forces, torques and velocities, built from the list of terms.
 
-Stage by stage, a launch or more for each, or a whole cell in one launch by one thread: a CPU works through the threads
-of a launch one after the other, and every launch costs it what some ten nodes do. Both call the same device functions
-in the same order, so the numbers are the same.
+Stage by stage, a launch or more for each, or all forces of a cell and what they do to its body in one launch by one
+thread: a CPU works through the threads of a launch one after the other, and every launch costs it what some ten nodes
+do. Both call the same device functions in the same order, so the numbers are the same.
 
 In an implicit step contact forces are given, and not evaluated (`launch_with_contacts`).
 """
@@ -13,13 +13,11 @@ from typing import Any
 
 import warp as wp
 
-from warpflag_kernels.base.plan import Flows
 from warpflag_kernels.base.precision import Precision
 from warpflag_kernels.base.term import Term, acting, combined, variant
 from warpflag_kernels.base.types import DeviceModel, DeviceState, structs
 from warpflag_kernels.contact import contact_list, neighbours
-from warpflag_kernels.fluid import body, node_velocity, rotne_prager, shell_flow
-from warpflag_kernels.fluid import shell as shell_stage
+from warpflag_kernels.fluid import body, node_velocity
 from warpflag_kernels.rod import forces
 
 
@@ -68,27 +66,20 @@ def _evaluators(p: Precision, terms: tuple[Term, ...]) -> tuple[Any, Any]:
 
 
 @functools.cache
-def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: Flows, pair_sum: str) -> Any:
-    Model, State = structs(p).Model, structs(p).State
-    PairSum, Neighbours, Shell = rotne_prager.struct(pair), neighbours.struct(p), shell_stage.struct(pair)
+def _of_cell(p: Precision, terms: tuple[Term, ...], moves: bool) -> Any:
+    Model, State, Neighbours = structs(p).Model, structs(p).State, neighbours.struct(p)
     evaluate_cell, evaluate_flagellum = _evaluators(p, terms)
-    gather, motion = forces.functions(p, terms).gather, body.functions(p, terms, flows.body)
+    gather, motion = forces.functions(p, terms).gather, body.functions(p, terms, False)
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
-    move_cell = node_velocity.functions(p, pair, flows.of_nodes, pair_sum).move_cell
-    beads = shell_flow.functions(p, pair, stored=True)
-    obstruct, carry = beads.obstruct, beads.carry
-    name = "_".join([variant(terms), flows.variant, pair_sum, *["short"] * (pair != p)])
 
-    @wp.kernel(module=p.module("whole_cell", name))
-    def right_hand_side(
+    @wp.kernel(module=p.module("whole_cell", variant(terms) + "_held" * (not moves)))
+    def forces_of_cell(
         # Model:
         model: Model,
         # Out:
         state: State,
-        s: PairSum,
         near: Neighbours,
-        shell: Shell,
     ):
         c = wp.tid()
         if state.active[c] == 0:
@@ -103,16 +94,12 @@ def _whole_cell(p: Precision, pair: Precision, terms: tuple[Term, ...], flows: F
                 e += 1
             sum_flagellum(model, state, k)
             k += 1
-        if wp.static(flows.body):
-            obstruct(model, state, shell, c)
-        if wp.static(settles):
+        if wp.static(moves and settles):
             settle(model, state, c)
-        move(model, state, c)
-        move_cell(model, state, s, c)
-        if wp.static(flows.body):
-            carry(model, state, shell, c)
+        if wp.static(moves):
+            move(model, state, c)
 
-    return right_hand_side
+    return forces_of_cell
 
 
 @functools.cache
@@ -203,12 +190,14 @@ def stages(model: DeviceModel) -> list[tuple[str, Callable[[DeviceModel, DeviceS
 
 
 def launch_right_hand_side(model: DeviceModel, state: DeviceState) -> None:
-    """Forces, torques and velocities at the pose of `state`: a cell in one launch or stage by stage, as planned."""
-    plan = model.plan
-    if plan.by_cells:
-        kernel = _whole_cell(model.precision, plan.pair_precision, model.terms, model.switches.flows, plan.pair_sum)
-        inputs = [model.data, state.data, state.pairs, state.neighbours, state.shell]
-        wp.launch(kernel, model.cell_count, inputs=inputs, device=model.device)
+    """Forces, torques and velocities at the pose of `state`: forces by whole cells or stage by stage, as planned."""
+    if not model.plan.by_cells:
+        for _name, launch in stages(model):
+            launch(model, state)
         return
-    for _name, launch in stages(model):
-        launch(model, state)
+    held = model.switches.flows.body  # the flow round it comes between its forces and its motion
+    kernel = _of_cell(model.precision, model.terms, not held)
+    wp.launch(kernel, model.cell_count, inputs=[model.data, state.data, state.neighbours], device=model.device)
+    if held:
+        body.motion_of_sums(model, state)
+    node_velocity.node_velocities(model, state)
