@@ -13,8 +13,8 @@ Each row is replayed alone, many times over in a captured loop, at the start of 
 later). The pass is timed as the loop does it: a stretch of a run, over the right-hand sides in it; "stepper" is what
 remains of it when the rows above are taken off. A CPU takes the forces of a cell and their sums in one launch and
 the pair sum in another; the stages below are those of a GPU, each with its own launches, and "saved" is what they take
-together beyond that. One launch costs what the row "a launch" says and, besides, a look at its arguments by every thread. C++ is the plain all-pairs
-sum over the same moving nodes, see pair_sum.py.
+together beyond that. One launch costs what the row "a launch" says and, besides, a look at its arguments by every
+thread. C++ is the plain all-pairs sum over the same moving nodes, see pair_sum.py.
 
 The second table has the whole right-hand side of larger cells, eight flagella, and 100 flagella of 51 nodes each; and
 two of its stages by themselves, where contact takes every pair twice.

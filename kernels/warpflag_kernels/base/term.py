@@ -1,8 +1,8 @@
 """A term of the forces: the device functions that it has, and the sums of those of several terms.
 
 Every right-hand side is built from one ordered list of terms (`stepping/terms.py`): launched stage by stage, for a
-whole cell in one launch, without the contacts that an implicit step solves for, or linearised. The Rotne-Prager sum and the
-mobility of the body act on the total and are no terms.
+whole cell in one launch, without the contacts that an implicit step solves for, or linearised. The Rotne-Prager sum and
+the mobility of the body act on the total and are no terms.
 """
 
 import functools
