@@ -112,7 +112,7 @@ def _with_contacts(
     sum_flagellum, move, settle = motion.sum_flagellum, motion.move, combined(p, terms).settle
     settles = settle is not None
 
-    @wp.kernel(module=p.module("whole_cell", variant(terms) + "_contacts" * touching))
+    @wp.kernel(module=p.module("whole_cell_in_step", variant(terms) + "_contacts" * touching))
     def with_contacts(
         # Model:
         model: Model,
