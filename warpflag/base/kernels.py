@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 import threading
@@ -20,6 +21,8 @@ from warpflag.base.streams import is_terminal, tell
 __all__ = ["load_kernels", "noted_launches"]
 
 _MOST_AT_ONCE = 4  # modules; each takes some 200 MB of memory while it is compiled
+# A thread that compiles begins with Warp's headers, which takes it as long as two modules of the usual size: 4 s.
+_LEAST_PER_THREAD = 3  # modules
 EXPLAINED_AFTER = 2.0  # after which a line says that kernels are being compiled: a warm cache needs no word
 _SECONDS_PER_LOOK = 0.2  # between two counts of what has been compiled: five a second
 _LOADED_FOLDERS: set[Path] = set()  # folders of the modules that this process has loaded
@@ -81,7 +84,7 @@ def load_kernels(
             _load(module, block, device)
     else:
         with _explained(missing, quiet, explained_after):
-            pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores()))
+            pool = ThreadPoolExecutor(min(_MOST_AT_ONCE, cores(), math.ceil(len(missing) / _LEAST_PER_THREAD)))
             try:
                 for loaded in [pool.submit(_load, module, block, device) for module, block in waiting]:
                     loaded.result()
