@@ -159,6 +159,11 @@ ROWS: list[tuple[str, Mapping[str, Any], Any, Mapping[str, Any]]] = [
         {"drag.mobility_along": None, "drag.mobility_across": None, **BODY, "pairs.mobility": 1 / (16e-3 * math.pi)}
         | {"drag.spin_mobility": 1 / (2.52e-6 * 0.2)},
     ),
+    (  # everything is ten times as fast there, and so are the shortest and the first step
+        *("fluid.viscosity", {}, 1e-4),
+        {"drag.mobility_along": None, "drag.mobility_across": None, **BODY, "pairs.mobility": 1 / (8e-4 * math.pi)}
+        | {"drag.spin_mobility": 1 / (1.26e-7 * 0.2), "steps.shortest": 2e-9, "steps.wanted_step": 1e-9},
+    ),
     ("fluid.drag_parallel", PAPER, 1.7e-3, {"drag.mobility_along": [*[5e3 / 1.7] * 5, 1e4 / 1.7] * 2}),
     (
         *("fluid.drag_perpendicular", PAPER, 3e-3),

@@ -106,6 +106,20 @@ def test_a_sheet_has_every_snapshot(run, tmp_path, count, size):
     assert barred == [False] * (count - 1) + [True]  # all have one scale
 
 
+@pytest.mark.parametrize(("rate", "count"), [(None, 12), (100.0, 23), (25.0, 6)])
+def test_a_film_has_pictures_from_the_first_frame_to_the_last(rate, count, run, tmp_path):
+    """At the movie's own 50 a second one of each of its twelve frames, at other rates those in between, or fewer."""
+    image = pytest.importorskip("PIL.Image")
+    render(run, tmp_path / "film.webp", size=(64, 36), frames_per_second=rate)
+    with image.open(tmp_path / "film.webp") as film:
+        assert film.n_frames == count
+        film.seek(count - 1)
+        last = np.array(film.convert("RGB")).astype(float)
+    if count != 6:  # eleven intervals have no half
+        render(run, tmp_path / "last.png", size=(64, 36))
+        assert np.abs(last - pixels_of(tmp_path / "last.png")).mean() < 6.0
+
+
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
     (tmp_path / "junk.usdc").write_text("junk")
     Usd.Stage.CreateNew(str(tmp_path / "bare.usda")).Save()

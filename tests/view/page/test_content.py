@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.scene import with_values
 from warpflag.view.coloring import BODY_COLOR, FLAGELLUM_COLORS, UNDEFINED_COLOR
 from warpflag.view.curves import curves
+from warpflag.view.page import notebook_frame, write_page
 from warpflag.view.page.content import content
 
 SCENE = with_values(THREE, {"polymorphs.enabled": True, "body.length": 3.0, "body.width": 0.9})
@@ -91,3 +93,10 @@ def test_a_page_is_told_what_the_record_has(record, most_bytes):
     for own, curve in zip(told["curves"], curves(record), strict=True):
         values = np.array([[np.nan if x is None else x for x in line] for line in own["lines"]]).T
         np.testing.assert_allclose(values, curve.values[frames], rtol=1e-4)
+
+
+def test_a_notebook_keeps_as_many_frames_as_it_has_room_for_and_a_file_all(record, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpflag.view.page.document._NOTEBOOK_BYTES", 9 * 83 * 3)
+    write_page(record, tmp_path / "cell.html")
+    for page, stride in ((html.unescape(notebook_frame(record)), 3), ((tmp_path / "cell.html").read_text(), 1)):
+        assert f'"frameStride":{stride},' in page

@@ -41,6 +41,8 @@ BREAKAGES = {
     "start after end": (lambda stage: stage.SetStartTimeCode(99), "time codes"),
     "no time codes per second": (lambda stage: stage.GetRootLayer().ClearTimeCodesPerSecond(), "timeCodesPerSecond"),
     "no frames per second": (lambda stage: stage.GetRootLayer().ClearFramesPerSecond(), "framesPerSecond"),
+    "no time code in a second": (lambda stage: stage.SetTimeCodesPerSecond(0), "timeCodesPerSecond"),
+    "no frame in a second": (lambda stage: stage.SetFramesPerSecond(0), "framesPerSecond"),
     "no unit": (lambda stage: stage.ClearMetadata("metersPerUnit"), "unit"),
     "no default prim": (lambda stage: stage.ClearDefaultPrim(), "default prim"),
     "no camera": (lambda stage: stage.RemovePrim("/World/Camera"), "camera"),
