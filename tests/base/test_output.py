@@ -8,7 +8,7 @@ import os
 import pytest
 
 from warpflag.base import output
-from warpflag.base.output import DiskError, OutputError, sync_file_systems, whole
+from warpflag.base.output import DiskError, OutputError, machine_error, sync_file_systems, whole
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path):
@@ -77,3 +77,18 @@ def test_a_device_that_could_not_store_all_is_told(tmp_path, monkeypatch):
         sync_file_systems([tmp_path, tmp_path.parent])
     assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(tmp_path.parent))
     assert asked == [tmp_path.stat().st_dev]  # once for the device
+
+
+@pytest.mark.parametrize(
+    ("place", "advised"),
+    [("kernels", True), ("kernels/wp_a/a.o", True), ("", True), ("other", False), ("kept/run.h5", False)],
+)
+def test_where_kernels_can_not_be_kept_another_folder_is_advised(place, advised, tmp_path, monkeypatch):
+    """Also where their folder can't be made for want of the one that it is to lie in."""
+    wp = pytest.importorskip("warp")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "kernels"))
+    path = str(tmp_path / place)
+    line = machine_error(PermissionError(errno.EACCES, "Permission denied", path))
+    assert line.startswith(f"{path}: Permission denied") and "\n" not in line
+    assert ("let WARP_CACHE_PATH name a folder that can be written" in line) == advised
+    assert machine_error(OSError("no file")) == "no file"

@@ -281,6 +281,17 @@ def test_spectral_radius_is_that_of_the_dense_jacobian(stiffness, device, precis
     assert 0.653 * ((stages - 2) ** 2 - 1) <= 1.3 * exact * 1e-7
 
 
+def test_the_search_for_the_radius_begins_alike_in_every_cell_and_moves_no_anchor(device):
+    scene = cell({"flagella.length": 1.0, "flagellum.1.segments": 4})
+    for scenes in ([scene], [cell({"flagella.count": 3}), scene]):
+        probe = Simulation(scenes, device=device).stepper.memory()["probe"][-11:].astype(np.float64)
+        own = anchors(scene)
+        assert not probe[own, :3].any() and probe[own, 3].all() and probe[free_nodes(scene)].all()
+        if len(scenes) == 1:
+            alone = probe
+    np.testing.assert_array_equal(probe, alone)
+
+
 def test_stage_count_follows_the_stiffness_during_a_run(device):
     scene = cell({"motor.torque": 1.0, "numerics.time_step": 1e-5})
     sim = Simulation(scene, device=device)
