@@ -16,7 +16,7 @@ from warpflag.record.recorder import Recorder
 from warpflag.scene import with_values
 from warpflag.view.coloring import BODY_COLOR, FLAGELLUM_COLORS, UNDEFINED_COLOR
 from warpflag.view.curves import curves
-from warpflag.view.page import notebook_frame, write_page
+from warpflag.view.page import notebook_frame, page_of, write_page
 from warpflag.view.page.content import content
 
 SCENE = with_values(THREE, {"polymorphs.enabled": True, "body.length": 3.0, "body.width": 0.9})
@@ -95,8 +95,15 @@ def test_a_page_is_told_what_the_record_has(record, most_bytes):
         np.testing.assert_allclose(values, curve.values[frames], rtol=1e-4)
 
 
-def test_a_notebook_keeps_as_many_frames_as_it_has_room_for_and_a_file_all(record, tmp_path, monkeypatch):
-    monkeypatch.setattr("warpflag.view.page.document._NOTEBOOK_BYTES", 9 * 83 * 3)
+def test_a_page_in_a_notebook_has_room_for_two_mebibytes_and_one_in_a_file_for_all(record, tmp_path, monkeypatch):
+    asked: list[int | None] = []
+
+    def noted(record, color_by="flagellum", follow=True, most_bytes=None):
+        asked.append(most_bytes)
+        return page_of(record, color_by, follow, 9 * 83 * 3 if most_bytes else None)
+
+    monkeypatch.setattr("warpflag.view.page.document.page_of", noted)
     write_page(record, tmp_path / "cell.html")
     for page, stride in ((html.unescape(notebook_frame(record)), 3), ((tmp_path / "cell.html").read_text(), 1)):
         assert f'"frameStride":{stride},' in page
+    assert asked == [None, 2 << 20]
