@@ -14,6 +14,7 @@ import pytest
 from tests.helpers import cell, helix_axis
 from warpflag.model.clear_start import clear_start
 from warpflag.model.geometry import ground_state, initial_state, phase_difference_at
+from warpflag.model.start import starting_state
 from warpflag.observables import phase_difference, turns_about_axis
 from warpflag.run.simulation import Simulation
 from warpflag.scene import Flagella, FlagellumOverride, Scene, SceneError, attachment, load, paper_scene, with_values
@@ -377,3 +378,12 @@ def test_a_flagellum_along_x_has_the_phase_of_one_that_is_hardly_turned_from_the
         one, other = (initial_state(cell({**values, **own})) for values in (along, beside))
         for x, y in zip(one.positions, other.positions, strict=True):
             np.testing.assert_allclose(x, y, atol=1e-5)
+
+
+@pytest.mark.parametrize("on_axis", [False, True])
+def test_a_helix_that_a_run_could_not_begin_with_is_refused_with_the_reason(on_axis):
+    """Joints twisted at rest by more than the guard of twists allows: no value of the motor would help."""
+    values = {"flagella.helix_radius": 0.09, "flagella.helix_pitch": 1.1, "flagella.on_axis": on_axis}
+    with pytest.raises(SceneError, match=r"flagella.segment_length = 0.4: makes segments .* take shorter ones"):
+        starting_state(cell({**values, "flagella.length": 2.4, "flagella.segment_length": 0.4}))
+    starting_state(cell({**values, "flagella.length": 2.4, "flagella.segment_length": 0.2}))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from warpflag_kernels.stepping.health import LARGEST_TWIST
 
 from warpflag.base import rotations
 from warpflag.model.clear_start import body_gaps, clear_start
 from warpflag.model.geometry import InitialState, initial_state
 from warpflag.record import Frame, Record, RecordError
 from warpflag.scene import Scene, SceneError, attachment, loads
+from warpflag.scene.helix import rest_shape
 
 __all__ = ["check_outside", "shape_of_frame", "starting_state"]
 
@@ -25,9 +29,10 @@ def starting_state(scene: Scene) -> InitialState:
 
     Raises:
         SceneError: `start.record` can't be read or holds another cell than the scene's, or the scene's own shape can't
-            be made clear.
+            be made clear or is twisted beyond what the guard allows.
     """
     if scene.start.record is None:
+        _check_twist(scene)
         return clear_start(scene, initial_state(scene))
     try:
         with Record(scene.start.record) as record:
@@ -72,6 +77,22 @@ def check_outside(scene: Scene, start: InitialState) -> None:
         if gaps.min() < 0.0:
             deep = f"node {int(gaps.argmin()) + 1} is {-gaps.min():.3g} um deep"
             raise SceneError("body.contact", True, f"the given start has flagellum {k} inside the body: {deep}")
+
+
+def _check_twist(scene: Scene) -> None:
+    """Refuses segments so long that a run would be stopped at once by the guard of twists, whatever drives it."""
+    group = scene.flagella
+    for spec in scene.resolved_flagella():
+        h = spec.segment_length
+        rest = rest_shape(group.strain_at_rest(h), h, spec.segment_count, group.on_axis)
+        twist = h * float(np.abs(rest.strain[:, 2]).max(initial=0.0))
+        if twist >= LARGEST_TWIST:
+            problem = (
+                f"makes segments of {h:.3g} um, whose joints are twisted by {math.degrees(twist):.3g} deg at rest; a "
+                "run takes less than 90: take shorter ones"
+            )
+            related = ["flagella.intrinsic_curvature", "flagella.helix_pitch"]
+            raise SceneError("flagella.segment_length", group.segment_length, problem, related)
 
 
 def _check_seeds(scene: Scene, record: Record) -> None:
