@@ -173,6 +173,7 @@ def structs(p: Precision) -> SimpleNamespace:
         # What moments were beyond their thresholds then, those that nucleate and those that propagate; 0 where that is
         # not known [pN um].
         beyond: wp.array(dtype=wp.vec2d)
+        reached: wp.array(dtype=wp.vec2d)  # the same at the look that is being taken
         rest_strain: wp.array(dtype=vec3)  # the array of `Rod`, which changes with time here [rad]
 
     @wp.struct
@@ -332,7 +333,7 @@ def allocate_state(model: DeviceModel) -> tuple[Any, SimpleNamespace]:
         parts.forms.changed = wp.full(elements, NEVER, dtype=wp.float64, device=device)
         parts.forms.flipped = wp.full(elements, NEVER, dtype=wp.float64, device=device)
         parts.forms.looked = zeros(elements, wp.float64)
-        parts.forms.beyond = zeros(elements, wp.vec2d)
+        parts.forms.beyond, parts.forms.reached = zeros(elements, wp.vec2d), zeros(elements, wp.vec2d)
         parts.forms.rest_strain = model.data.rod.rest_strain
     attach(parts, s, device)
     return s, parts

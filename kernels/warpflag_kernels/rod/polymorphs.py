@@ -4,22 +4,24 @@ The forms are that of the scene's ground state, 0, a target, 1, and one that joi
 flips a joint is the moment about the helix axis against the handedness of form 0, as a reversed motor winds a filament
 up. Joints near the root or the tip flip by themselves (nucleation) when their moment along the ground state,
 
-    m = -(A (Omega - Omega_p)) . Omega_p/|Omega_p|,     Omega_p: ground state of its form; other sign if of other hand,
+    m = -(A (Omega - Omega_0)) . Omega_0/|Omega_0|,     Omega_0: ground state of form 0,
 
-exceeds one threshold, and back when it falls below another; in a helix that is wound up uniformly it is the moment
-about the axis. Any joint flips beside one of the other form (propagation) at lower thresholds. There the local m says
-little: a joint of semicoiled form amid the normal one has an eighth of it, and a kinked filament is bent by its
-thrust. What counts is the mean moment over a turn of the helix about the mean tangent, in which bending cancels; near
-the ends over less, as much to either side, so that it is the moment at the joint.
+exceeds one threshold; in a helix that is wound up uniformly it is the moment about the axis. They flip back when the
+moment about the axis falls below another. Any joint flips beside one of the other form (propagation) at lower
+thresholds. There the local m says little: a joint of semicoiled form amid the normal one has an eighth of it, and a
+kinked filament is bent by its thrust. What counts is the mean moment over a turn of the helix about the mean tangent,
+in which bending cancels; near the ends over less, as much to either side, so that it is the moment at the joint.
 
 From times on that are drawn before the run begins, joints of form 1 go on to form 2, one after the other from the root,
 as long as the motor winds the filament up. They flip back to form 0 as those of form 1 do.
 
 A joint's ground state goes over within a ramp, as a smooth step, so that the steppers see quadratic energies that
-change with time. Joints neither flip nor lead to a flip while their ramp lasts. They are looked at where a step has
-been accepted, but flip from the time on at which they had reason to: when the last ramp of theirs or of the neighbour
-that leads them was over, and when the moment passed its threshold, in a straight line between two looks. The next step
-begins with that part of the ramp behind it. Were it the end of the step, a front would lag by half a step per joint.
+change with time. Joints neither flip nor lead to a flip while their ramp lasts, and a joint that a neighbour leads
+flips with that one, not by itself. They are looked at where a step has been accepted, but flip from the time on at
+which they had reason to: when the last ramp of theirs or of the neighbour that leads them was over, and when the moment
+passed its threshold, in a straight line between two looks; one after the other in the order of these times, since a
+flip gives neighbours a reason and takes it from others. The next step begins with that part of the ramp behind it. Were
+it the end of the step, a front would lag by half a step per joint.
 
 Source: Hotani, J. Mol. Biol. 156, 791 (1982): torques of -1.1 and +0.4 pN um take filaments from normal to semicoiled
 and back, in transitions that travel along the filament.
@@ -109,15 +111,12 @@ def _kernels(p: Precision) -> SimpleNamespace:
 
     @wp.func(module=module)
     def end_moment(model: Model, state: State, chart: Chart, e: wp.int32, k: wp.int32, now: wp.float64):
-        """Moment of joint e along its ground state, against the handedness of form 0 [pN um]."""
-        rest = model.polymorphs[0].rest_strain[3 * e + state.forms[0].form[e]]
+        """Moment of joint e of form 0 along its ground state, against its handedness [pN um]."""
+        rest = model.polymorphs[0].rest_strain[3 * e]
         d = strain_change(model, state, chart, e, k, now)
         a = model.rod.bending_rigidity[k]
         moment = vec3(a * d[0], a * d[1], model.rod.twist_rigidity[k] * d[2])
-        m = -wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k])
-        if rest[2] * model.polymorphs[0].rest_strain[3 * e][2] < real(0.0):
-            m = -m
-        return wp.float64(m)
+        return wp.float64(-wp.dot(moment, rest) / (wp.length(rest) * model.rod.segment_length[k]))
 
     @wp.func(module=module)
     def axial_moment(
@@ -189,6 +188,94 @@ def _kernels(p: Precision) -> SimpleNamespace:
             i += 1
         return wp.float64(-1.0)
 
+    @wp.func(module=module)
+    def look_at(
+        model: Model,
+        state: State,
+        chart: Chart,
+        e: wp.int32,
+        k: wp.int32,
+        now: wp.float64,
+        root: wp.int32,
+        tip: wp.int32,
+        at_end: wp.bool,
+    ):
+        """What the moment at joint e is beyond the thresholds of nucleation and propagation [pN um]; 0 where the joint
+        can't flip so."""
+        left = wp.min(state.forms[0].form[e], 1)
+        nucleates = wp.float64(0.0)
+        propagates = wp.float64(0.0)
+        beside = bool(False)
+        if e > root:
+            beside = wp.min(state.forms[0].form[e - 1], 1) != left
+        if e < tip:
+            beside = beside or wp.min(state.forms[0].form[e + 1], 1) != left
+        if at_end and left == 0:
+            nucleates = end_moment(model, state, chart, e, k, now) - model.polymorphs[0].nucleation[k][0]
+        if beside or (at_end and left == 1):
+            m = axial_moment(model, state, chart, e, k, now, root, tip)
+            if at_end and left == 1:
+                nucleates = model.polymorphs[0].nucleation[k][1] - m
+            if beside and left == 1:
+                propagates = model.polymorphs[0].propagation[k][1] - m
+            if beside and left == 0:
+                propagates = m - model.polymorphs[0].propagation[k][0]
+        return wp.vec2d(nucleates, propagates)
+
+    @wp.func(module=module)
+    def next_flip(
+        model: Model,
+        state: State,
+        e: wp.int32,
+        k: wp.int32,
+        now: wp.float64,
+        root: wp.int32,
+        tip: wp.int32,
+        at_end: wp.bool,
+        begun: wp.float64,
+    ):
+        """When joint e flips by what has been looked at [s], -1 if it does not, and its form then."""
+        form = state.forms[0].form[e]
+        left = wp.min(form, 1)
+        ramp = model.polymorphs[0].ramp[k]
+        when = wp.float64(-1.0)
+        becomes = 1 - left
+        since = state.forms[0].looked[e]
+        able = wp.max(since, state.forms[0].changed[e] + ramp)
+        leads = now + wp.float64(1.0)  # from when on a neighbour of the other form leads it
+        follows = e == root
+        ready = begun
+        if e > root:
+            before = state.forms[0].changed[e - 1]
+            if state.forms[0].flipped[e - 1] == now:
+                able = wp.max(able, before)
+            if wp.min(state.forms[0].form[e - 1], 1) != left:
+                leads = before + ramp
+            follows = state.forms[0].form[e - 1] == 2
+            ready = wp.max(ready, before + ramp)
+        if e < tip:
+            after = state.forms[0].changed[e + 1]
+            if state.forms[0].flipped[e + 1] == now:
+                able = wp.max(able, after)
+            if wp.min(state.forms[0].form[e + 1], 1) != left:
+                leads = wp.min(leads, after + ramp)
+        if state.forms[0].flipped[e] == now or able > now:
+            return when, becomes
+        was = state.forms[0].beyond[e]
+        is_now = state.forms[0].reached[e]
+        if leads <= now:
+            when = flips(since, wp.max(able, leads), now, was[1], is_now[1])
+        if at_end:
+            alone = flips(since, able, now, was[0], is_now[0])
+            if alone >= wp.float64(0.0) and alone < leads and (when < wp.float64(0.0) or alone < when):
+                when = alone
+        if form == 1 and follows and begun >= wp.float64(0.0):
+            ready = wp.max(ready, able)
+            if ready <= now and (when < wp.float64(0.0) or ready < when):
+                when = ready
+                becomes = 2
+        return when, becomes
+
     @wp.kernel(module=module)
     def flip(
         # Model:
@@ -209,67 +296,44 @@ def _kernels(p: Precision) -> SimpleNamespace:
         now = control.time[c]
         if counted == 0:
             now = advanced(control, c)
-        ramp = model.polymorphs[0].ramp[k]
         root = first + 1
         tip = model.first_node[k + 1] - 2
         reach = 1 + wp.int32(real(end_length) / model.rod.segment_length[k])
-        nucleation = model.polymorphs[0].nucleation[k]
-        propagation = model.polymorphs[0].propagation[k]
         begun = going_on(model, k, now)
-        # The joint before this one as it was when the step ended: `before` is 0 in form 0, 1 in another form, 2 where
-        # there is no joint; `form_before` is its form, 2 at the root; `over_before`, when its ramp is over [s].
-        before = int(2)
-        form_before = int(2)
-        over_before = state.forms[0].looked[root]
         e = root
         while e <= tip:
-            form = state.forms[0].form[e]
-            left = wp.min(form, 1)
-            over = state.forms[0].changed[e] + ramp
-            since = state.forms[0].looked[e]
-            after = int(2)
-            over_after = since
-            if e < tip:
-                after = wp.min(state.forms[0].form[e + 1], 1)
-                over_after = state.forms[0].changed[e + 1] + ramp
-            # How far moments are beyond their thresholds, also while a ramp still has to end before that counts.
-            nucleates = wp.float64(0.0)
-            propagates = wp.float64(0.0)
-            becomes = int(form)
-            when = wp.float64(-1.0)
-            able = wp.max(since, over)
-            led = bool(False)
-            if before == 1 - left or after == 1 - left:
-                leads = over_after
-                if before == 1 - left:
-                    leads = wp.where(after == 1 - left, wp.min(over_before, over_after), over_before)
-                led = leads <= now
-                m = axial_moment(model, state, chart, e, k, now, root, tip)
-                propagates = wp.where(left == 0, m - propagation[0], propagation[1] - m)
-                when = flips(since, wp.max(able, leads), now, state.forms[0].beyond[e][1], propagates)
-            if over <= now and not led and (e - root < reach or tip - e < reach):
-                if left == 0:
-                    nucleates = end_moment(model, state, chart, e, k, now) - nucleation[0]
-                else:
-                    nucleates = nucleation[1] - axial_moment(model, state, chart, e, k, now, root, tip)
-                when = flips(since, able, now, state.forms[0].beyond[e][0], nucleates)
-            if when >= wp.float64(0.0):
-                becomes = 1 - left
-            elif form == 1 and form_before == 2 and begun >= wp.float64(0.0) and wp.max(able, over_before) <= now:
-                becomes = 2
-                when = wp.max(wp.max(able, over_before), begun)
-            if becomes != form:
-                state.forms[0].before[e] = form
-                state.forms[0].form[e] = becomes
-                state.forms[0].changed[e] = when
-                state.forms[0].flipped[e] = now
-                nucleates = wp.float64(0.0)
-                propagates = wp.float64(0.0)
-            state.forms[0].beyond[e] = wp.vec2d(nucleates, propagates)
+            at_end = e - root < reach or tip - e < reach
+            state.forms[0].reached[e] = look_at(model, state, chart, e, k, now, root, tip, at_end)
+            e += 1
+        # One flip after the other in the order of their times: it may give a neighbour its reason or take that away.
+        found = int(root)
+        while found >= 0:
+            found = int(-1)
+            earliest = wp.float64(0.0)
+            form = int(0)
+            e = root
+            while e <= tip:
+                at_end = e - root < reach or tip - e < reach
+                when, becomes = next_flip(model, state, e, k, now, root, tip, at_end, begun)
+                if when >= wp.float64(0.0) and (found < 0 or when < earliest):
+                    found = e
+                    earliest = when
+                    form = becomes
+                e += 1
+            if found >= 0:
+                state.forms[0].before[found] = state.forms[0].form[found]
+                state.forms[0].form[found] = form
+                state.forms[0].changed[found] = earliest
+                state.forms[0].flipped[found] = now
+                e = wp.max(found - 1, root)
+                while e <= wp.min(found + 1, tip):
+                    at_end = e - root < reach or tip - e < reach
+                    state.forms[0].reached[e] = look_at(model, state, chart, e, k, now, root, tip, at_end)
+                    e += 1
+        e = root
+        while e <= tip:
+            state.forms[0].beyond[e] = state.forms[0].reached[e]
             state.forms[0].looked[e] = now
-            before = left
-            form_before = form
-            over_before = over
             e += 1
 
     return SimpleNamespace(ground_states=ground_states, flip=flip)
