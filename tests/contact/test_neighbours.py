@@ -28,7 +28,7 @@ class Cells:
         scenes = [
             touching_cell({"flagella.segment_length": 0.05, "flagella.length": 1.0}, precision, separation=0.13),
             touching_cell(unequal, precision, separation=0.13),
-            touching_cell({"flagella.segment_length": 0.8, "flagella.length": 3.2}, precision, separation=0.13),
+            touching_cell({"flagella.segment_length": 0.7, "flagella.length": 2.8}, precision, separation=0.13),
             touching_cell({**three, "flagella.length": 1.0}, precision, separation=0.13),
             cell({}, precision),
         ]
